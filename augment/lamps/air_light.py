@@ -13,8 +13,8 @@ light that is scattered once is
 
 sigma is the mean extinction between camera and lamp, and all of it scatters. The range of delta is
 divided into intervals. In each the medium is integrated exactly, by the table of
-`augment.lamps.fog_phase`, and the pattern I enters by its mean. Intervals are narrow at both ends
-of the range, as the points of Gauss and Legendre are.
+`augment.lamps.fog_phase`, and the pattern I enters by its mean. Intervals are narrow towards the
+camera. `augment.lamps.halo_tables` has the sum of each lamp at some angles.
 
 Light that is scattered several times is a factor on L_1, fitted to photons followed one by one
 (isotropic lamp, endless fog; T = sigma D up to 4, gamma up to 45 degrees):
@@ -105,8 +105,8 @@ def air_light(
         distance_m: distance of each pixel's surface along its ray, metres; 0, inf or nan for the
             sky.
         air: extinction of the air.
-        num_points: intervals of the integral, 1 to 16; the recording car's own beams take twice as
-            many, up to 16, and lamps without a pattern take one, which is exact.
+        num_points: fours of intervals of the integral, 1 to 16; the recording car's own beams take
+            twice as many, up to 16.
         step_px: pixels between the nodes.
         threshold_cd_m2: luminance below which a lamp's light may be left out, cd/m2.
         visible_shares: share of each lamp's light that is not hidden, 0 to 1; None for all of it.

@@ -50,7 +50,7 @@ MAX_FACTOR_DEPTH = 4.0
 MAX_FACTOR_ANGLE_DEG = math.degrees(MAX_FACTOR_ANGLE_RAD)
 # Nearest distance of a lamp from the camera, metres; nearer ones would be inside the lens.
 MIN_DISTANCE_M = 0.05
-# Largest number of intervals.
+# Largest number of points of the recipe's sum.
 MAX_POINTS = 16
 # Spread of a beam, degrees, below which its planes are fine.
 FINE_SPREAD_DEG = 25.0
@@ -124,8 +124,6 @@ class Halos:
 
     lamps: HaloLamps
     """Numbers of the lamps; their tables have no place yet."""
-    is_own: Bool[np.ndarray, "M"]
-    """True for lamps of the recording car."""
     scatter: Float32[np.ndarray, "P U T"]
     """Tables of G: of other lamps, and of lamps of the recording car."""
     flux: Float32[np.ndarray, "N"]
@@ -168,7 +166,7 @@ def find_halos(
     distances = np.linalg.norm(offsets, axis=1)
     sigmas = air.mean_extinction_per_m(np.broadcast_to(centre, offsets.shape), lamps.positions_m)
     fog_sigmas = sigmas - air.scattering_precipitation_per_m
-    peaks = lamps.intensities_cd * lamps.tables.max((1, 2), initial=0.0)[lamps.patterns] * shares
+    peaks = lamps.peak_intensities_cd * shares
     can_light = (distances >= MIN_DISTANCE_M) & (sigmas > 0) & (peaks > 0)
     if not can_light.any():
         return None
@@ -224,7 +222,7 @@ def find_halos(
         np.ascontiguousarray(layouts[is_lit]),
     )
     scatter = np.stack([scatter_table(lobe) for lobe in lobes])
-    return Halos(numbers, is_own[rows][is_lit], scatter, flux)
+    return Halos(numbers, scatter, flux)
 
 
 def fill_halo_tables(halos: Halos, camera: Camera, step_px: int) -> Iterator[HaloTables]:
@@ -241,7 +239,7 @@ def fill_halo_tables(halos: Halos, camera: Camera, step_px: int) -> Iterator[Hal
     sizes = layouts[:, NUM_NODES] * layouts[:, PLANES] * lengths
     for is_own, coarse_rad in ((False, MAX_COARSE_RAD), (True, MAX_OWN_COARSE_RAD)):
         num_steps = min(max(int(coarse_rad * focal_px / step_px), 1), MAX_COARSE_STEPS)
-        rows = np.flatnonzero(halos.is_own == is_own)
+        rows = np.flatnonzero(layouts[:, SCATTER] == is_own)
         batches = np.cumsum(sizes[rows]) // MAX_TABLE_NUMBERS
         for batch in np.unique(batches):
             lamps = HaloLamps(*(array[rows[batches == batch]] for array in halos.lamps))

@@ -135,6 +135,11 @@ class Lamps:
     def __len__(self) -> int:
         return len(self.positions_m)
 
+    @property
+    def peak_intensities_cd(self) -> Float64[np.ndarray, "M"]:
+        """Largest intensities in any direction, candela."""
+        return self.intensities_cd * self.tables.max((1, 2), initial=0.0)[self.patterns]
+
     def select(self, index: np.ndarray | slice) -> Lamps:
         """Return the lamps at the given indices or mask, in that order, with the same tables."""
         return replace(self, **{name: getattr(self, name)[index] for name in _COLUMNS})

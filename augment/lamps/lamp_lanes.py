@@ -36,7 +36,6 @@ def lamp_table(
         frame: x, y and z of the table's frame in the world, rows.
         eye: origin of the table's frame, world, metres.
     """
-    peaks = lamps.tables.reshape(len(lamps.tables), -1).max(1, initial=0).astype(np.float64)
     table = np.empty((len(lamps), NUM_COLUMNS), np.float32)
     table[:, PLACE : PLACE + 3] = (lamps.positions_m - eye) @ frame.T
     table[:, AXIS : AXIS + 3] = lamps.axes @ frame.T
@@ -45,7 +44,7 @@ def lamp_table(
     table[:, CANDELA] = lamps.intensities_cd
     table[:, EXTINCTION] = extinctions_per_m
     table[:, SOFTENING] = softening_m2
-    table[:, PEAK] = lamps.intensities_cd * peaks[lamps.patterns]
+    table[:, PEAK] = lamps.peak_intensities_cd
     table[:, COLOR : COLOR + 3] = lamps.colors
     return table
 

@@ -63,13 +63,12 @@ def lamp_arrays(
         shadows: depth maps from the recording car's lamps.
     """
     count = len(lamps)
-    peaks = lamps.tables.reshape(len(lamps.tables), -1).max(1, initial=0).astype(np.float64)
     arrays = LampArrays(
         lamps.positions_m,
         lamps.axes,
         lamps.ups,
         lamps.intensities_cd,
-        lamps.intensities_cd * peaks[lamps.patterns] if count else np.zeros(0),
+        lamps.peak_intensities_cd,
         lamps.patterns,
         lamps.tables,
         lamps.colors,
