@@ -138,6 +138,21 @@ def test_no_snow_changes_no_bit_and_a_little_more_changes_little(scene: Scene) -
         assert np.abs(next_ - now).mean() < 0.1
 
 
+@pytest.mark.parametrize(("depth_m", "missing_share"), [(0.006, 0.12), (0.01, 0.05)])
+def test_splats_larger_than_cells_do_not_hide_the_snow_behind_their_centres(
+    scene: Scene, depth_m: float, missing_share: float
+) -> None:
+    dry, thin, deep = (view_of(scene, snow(d)) for d in (0.0, depth_m, LAID_M))
+    is_road = dry.semantic == ROAD
+    light, whitened, white = (view.rgb.astype(float)[is_road].mean() for view in (dry, thin, deep))
+    cells = cells_of(scene, snow(depth_m))
+    shares, _ = define_snow(cells, state_of(snow(depth_m)))
+    share = shares[(cells.road > 0.99) & (cells.depths_m > 0)].mean()
+    # Splats before the snow hide some of it where it has gaps: twice as much if one bare cell
+    # kept them whole.
+    assert share - missing_share < (whitened - light) / (white - light) < share + 0.02
+
+
 def test_what_views_leave_out_changes_no_bit(scene: Scene) -> None:
     layers = build_changing_layers(scene, SnowPlan(snow(0.02), 7))
     camera = _camera(scene, 2)
