@@ -11,7 +11,6 @@ import torch
 from augment.effects.snow.changing_kernels import ChangingCells
 from augment.effects.snow.changing_snow import (
     GRASS_COVERING_DEPTH_M,
-    HARD_COVERING_DEPTH_M,
     changing_cells,
     define_snow,
     find_depths_at,
@@ -29,7 +28,7 @@ from augment.scene.scene import Scene
 from augment.scene.semantics import SemanticClass
 from augment.view.render_view import render_view
 from recipes.schema import Output, Recipe, Weather
-from recipes.snow import Snow, SnowRoad
+from recipes.snow import HARD_COVERING_DEPTH_M, Snow, SnowRoad
 from tests.snow_scenes import box_car, drive, sheet
 
 ROAD, GRASS, CAR = (int(SemanticClass[name]) for name in ("ROAD", "TERRAIN", "VEHICLE"))
