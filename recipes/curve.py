@@ -8,6 +8,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
+from recipes import polynomial
+from recipes.polynomial import Polynomial
+
 Shape = Literal["linear", "step", "smooth"]
 
 
@@ -19,24 +22,16 @@ class Piece:
     """Begin of the part, seconds."""
     end_s: float
     """End of the part, seconds."""
-    coefficients: tuple[float, ...]
+    coefficients: Polynomial
     """Coefficients of 1, t, t^2, t^3, where t is the time since `start_s` in seconds."""
 
     def value(self, time_s: float) -> float:
         """Return the polynomial's value at a time of the part."""
-        t = time_s - self.start_s
-        total = 0.0
-        for coefficient in reversed(self.coefficients):
-            total = total * t + coefficient
-        return total
+        return polynomial.value(self.coefficients, time_s - self.start_s)
 
     def integral(self, time_s: float) -> float:
         """Return the integral from the part's begin to a time of the part, value x seconds."""
-        t = time_s - self.start_s
-        total = 0.0
-        for power in range(len(self.coefficients) - 1, -1, -1):
-            total = total * t + self.coefficients[power] / (power + 1)
-        return total * t
+        return polynomial.value(polynomial.integral(self.coefficients), time_s - self.start_s)
 
 
 @dataclass(frozen=True)
@@ -98,8 +93,7 @@ class Curve:
         if index == len(self.times_s) - 1:
             return Piece(begin_s, end_s, (self.values[-1],))
         piece = self._piece(index)
-        shift = begin_s - piece.start_s
-        return Piece(begin_s, end_s, _shifted(piece.coefficients, shift))
+        return Piece(begin_s, end_s, polynomial.shift(piece.coefficients, begin_s - piece.start_s))
 
     def _piece(self, index: int) -> Piece:
         """Return the curve between point `index` and the next one."""
@@ -113,12 +107,3 @@ class Curve:
         if self.shape == "linear":
             return Piece(start_s, end_s, (first, change / width))
         return Piece(start_s, end_s, (first, 0.0, 3 * change / width**2, -2 * change / width**3))
-
-
-def _shifted(coefficients: tuple[float, ...], shift: float) -> tuple[float, ...]:
-    """Return the coefficients of a polynomial in t - shift, from those in t."""
-    result = list(coefficients)
-    for start in range(len(result) - 1):
-        for power in range(len(result) - 2, start - 1, -1):
-            result[power] += shift * result[power + 1]
-    return tuple(result)

@@ -17,6 +17,8 @@ SNOWFALL = "weather.snowfall.rate_mm_h"
 RAIN = "weather.rain.rate_mm_h"
 # Least depth for which a layer is laid that is then scaled, metres.
 MIN_LAID_DEPTH_M = 0.01
+# Depth at which all but 1/e of a hard surface is white, of snow over time, metres. Assumed.
+HARD_COVERING_DEPTH_M = 0.005
 # Water on a road, from snow that melted on it, that wets all but 1/e of it, mm. Assumed.
 WETTING_MM = 0.15
 # Time from the first snow on in which 1 - 1/e of the traffic has driven, seconds. Assumed.
@@ -154,6 +156,19 @@ class Snow(EffectModel):
         return road.wetness > 0 or (road.depth_m > 0 and self.coverage > 0)
 
     @property
+    def is_laid(self) -> bool:
+        """Return True if a layer is laid for this snow, with or without effect at the moment."""
+        return self.has_effect or self.placed_depth_m is not None
+
+    @property
+    def road_cover(self) -> float:
+        """Return the share of roads under snow, 0 to 1, before cars drive over it."""
+        if not self.is_scaled:
+            return self.coverage if self.has_effect else 0.0
+        road_depth_m = self.depth_m if self.road is None else self.road.depth_m
+        return self.coverage * -math.expm1(-road_depth_m / HARD_COVERING_DEPTH_M)
+
+    @property
     def is_scaled(self) -> bool:
         """Return True if the layer is laid for one depth and scaled to another."""
         return self.placed_depth_m is not None or self.road is not None
@@ -225,11 +240,10 @@ class Snow(EffectModel):
         return self.model_copy(update=fields)
 
     def beam_surface(self, output_surface: str) -> tuple[str, bool] | None:
-        return (
-            (f"snow {self.depth_m:.3g} m deep", output_surface != "scene")
-            if self.depth_m > 0 and self.coverage > 0
-            else None
-        )
+        depth_m = self.depth_m if self.road is None else max(self.depth_m, self.road.depth_m)
+        if depth_m == 0 or self.coverage == 0:
+            return None
+        return f"snow {depth_m:.3g} m deep", output_surface != "scene"
 
 
 def _snow_weather(depth_m: float, moment: Moment) -> SnowWeather | None:

@@ -28,11 +28,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
+from recipes import polynomial
 from recipes.curve import Curve
+from recipes.polynomial import Polynomial
 
 SECONDS_PER_HOUR = 3600.0
 SECONDS_PER_DAY = 86400.0
@@ -59,7 +61,6 @@ _WEIGHTS = (
 # Parts of a stretch between two points to which the rule is applied: errors stay below 1e-7.
 _NUM_PARTS = 4
 
-Polynomial = tuple[float, ...]
 _ALWAYS_ZERO = Curve.constant(0.0)
 
 
@@ -134,16 +135,16 @@ def layer_at(time_s: float, weather: SnowWeather, surface: Surface = _GROUND) ->
     fallen_mm = begin_mm
     is_begin_left = True
     for begin, end, snowfall, melt in _stretches(weather, surface, weather.begin_s, end_s):
-        change = _integral(_sum(snowfall, _scaled(melt, -1.0)))
-        for t in (*_roots(_derivative(change), end - begin), end - begin):
-            excess_mm = total_mm + _value(change, t) - floor_mm
+        change = polynomial.integral(polynomial.add(snowfall, polynomial.scale(melt, -1.0)))
+        for t in (*polynomial.roots(polynomial.derivative(change), end - begin), end - begin):
+            excess_mm = total_mm + polynomial.value(change, t) - floor_mm
             if excess_mm <= least_mm:
                 least_mm = excess_mm
                 bare_s = begin + t
                 is_begin_left = False
-        total_mm += _value(change, end - begin)
-        fallen_mm += _value(_integral(snowfall), end - begin)
-        potential_mm += _value(_integral(melt), end - begin)
+        total_mm += polynomial.value(change, end - begin)
+        fallen_mm += polynomial.value(polynomial.integral(snowfall), end - begin)
+        potential_mm += polynomial.value(polynomial.integral(melt), end - begin)
     water_mm = max(total_mm - least_mm, 0.0)
     volume = _depth_per_water(weather, bare_s, end_s, begin_mm if is_begin_left else 0.0)
     return SnowLayer(
@@ -226,18 +227,24 @@ def _stretches(
         snowfall, rain, air, warmer = (
             next(curve.pieces(begin, end)).coefficients for curve in curves
         )
-        celsius = _sum(air, warmer)
-        snowfall = _scaled(snowfall, 1 / SECONDS_PER_HOUR)
-        per_kelvin = _sum(
-            (DEGREE_DAY_MM / SECONDS_PER_DAY,), _scaled(rain, RAIN_MELT_PER_K / SECONDS_PER_HOUR)
+        celsius = polynomial.add(air, warmer)
+        snowfall = polynomial.scale(snowfall, 1 / SECONDS_PER_HOUR)
+        per_kelvin = polynomial.add(
+            (DEGREE_DAY_MM / SECONDS_PER_DAY,),
+            polynomial.scale(rain, RAIN_MELT_PER_K / SECONDS_PER_HOUR),
         )
-        zeros = [0.0, *_roots(celsius, end - begin), end - begin]
+        zeros = [0.0, *polynomial.roots(celsius, end - begin), end - begin]
         for first, last in itertools.pairwise(zeros):
             if last <= first:
                 continue
-            is_warm = _value(celsius, (first + last) / 2) > 0
-            melt = _product(per_kelvin, celsius) if is_warm else (0.0,)
-            yield begin + first, begin + last, _shifted(snowfall, first), _shifted(melt, first)
+            is_warm = polynomial.value(celsius, (first + last) / 2) > 0
+            melt = polynomial.multiply(per_kelvin, celsius) if is_warm else (0.0,)
+            yield (
+                begin + first,
+                begin + last,
+                polynomial.shift(snowfall, first),
+                polynomial.shift(melt, first),
+            )
 
 
 def _times(begin_s: float, end_s: float, *curves: Curve) -> list[float]:
@@ -246,67 +253,3 @@ def _times(begin_s: float, end_s: float, *curves: Curve) -> list[float]:
         return [begin_s]
     inner = {t for curve in curves for t in curve.times_s if begin_s < t < end_s}
     return [begin_s, *sorted(inner), end_s]
-
-
-def _value(polynomial: Polynomial, t: float) -> float:
-    total = 0.0
-    for coefficient in reversed(polynomial):
-        total = total * t + coefficient
-    return total
-
-
-def _sum(a: Polynomial, b: Polynomial) -> Polynomial:
-    return tuple(x + y for x, y in itertools.zip_longest(a, b, fillvalue=0.0))
-
-
-def _scaled(polynomial: Polynomial, factor: float) -> Polynomial:
-    return tuple(factor * coefficient for coefficient in polynomial)
-
-
-def _product(a: Polynomial, b: Polynomial) -> Polynomial:
-    total = [0.0] * (len(a) + len(b) - 1)
-    for i, x in enumerate(a):
-        for j, y in enumerate(b):
-            total[i + j] += x * y
-    return tuple(total)
-
-
-def _integral(polynomial: Polynomial) -> Polynomial:
-    """Return the integral from 0."""
-    return (0.0, *(c / (power + 1) for power, c in enumerate(polynomial)))
-
-
-def _derivative(polynomial: Polynomial) -> Polynomial:
-    return tuple(power * c for power, c in enumerate(polynomial))[1:]
-
-
-def _shifted(polynomial: Polynomial, shift: float) -> Polynomial:
-    """Return p(t + shift)."""
-    result = list(polynomial)
-    for start in range(len(result) - 1):
-        for power in range(len(result) - 2, start - 1, -1):
-            result[power] += shift * result[power + 1]
-    return tuple(result)
-
-
-def _roots(polynomial: Sequence[float], end: float) -> list[float]:
-    """Return the points inside (0, end) at which a polynomial changes its sign."""
-    if len(polynomial) < 2 or end <= 0:
-        return []
-    coefficients = tuple(polynomial)
-    stops = [0.0, *_roots(_derivative(coefficients), end), end]
-    roots = list[float]()
-    for low, high in itertools.pairwise(stops):
-        at_low = _value(coefficients, low)
-        if at_low * _value(coefficients, high) >= 0:
-            continue
-        for _ in range(100):
-            middle = (low + high) / 2
-            if not low < middle < high:
-                break
-            if (_value(coefficients, middle) < 0) == (at_low < 0):
-                low = middle
-            else:
-                high = middle
-        roots.append(high)
-    return roots

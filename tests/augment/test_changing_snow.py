@@ -11,7 +11,6 @@ import torch
 from augment.effects.snow.changing_kernels import ChangingCells
 from augment.effects.snow.changing_snow import (
     GRASS_COVERING_DEPTH_M,
-    HARD_COVERING_DEPTH_M,
     changing_cells,
     define_snow,
     find_depths_at,
@@ -29,7 +28,7 @@ from augment.scene.scene import Scene
 from augment.scene.semantics import SemanticClass
 from augment.view.render_view import render_view
 from recipes.schema import Output, Recipe, Weather
-from recipes.snow import Snow, SnowRoad
+from recipes.snow import HARD_COVERING_DEPTH_M, Snow, SnowRoad
 from tests.snow_scenes import box_car, drive, sheet
 
 ROAD, GRASS, CAR = (int(SemanticClass[name]) for name in ("ROAD", "TERRAIN", "VEHICLE"))
@@ -136,6 +135,21 @@ def test_no_snow_changes_no_bit_and_a_little_more_changes_little(scene: Scene) -
         # a popping disc changes its pixels by a hundred levels
         assert np.abs(next_ - now).max() <= 4
         assert np.abs(next_ - now).mean() < 0.1
+
+
+@pytest.mark.parametrize(("depth_m", "missing_share"), [(0.006, 0.12), (0.01, 0.05)])
+def test_splats_larger_than_cells_do_not_hide_the_snow_behind_their_centres(
+    scene: Scene, depth_m: float, missing_share: float
+) -> None:
+    dry, thin, deep = (view_of(scene, snow(d)) for d in (0.0, depth_m, LAID_M))
+    is_road = dry.semantic == ROAD
+    light, whitened, white = (view.rgb.astype(float)[is_road].mean() for view in (dry, thin, deep))
+    cells = cells_of(scene, snow(depth_m))
+    shares, _ = define_snow(cells, state_of(snow(depth_m)))
+    share = shares[(cells.road > 0.99) & (cells.depths_m > 0)].mean()
+    # Splats before the snow hide some of it where it has gaps: twice as much if one bare cell
+    # kept them whole.
+    assert share - missing_share < (whitened - light) / (white - light) < share + 0.02
 
 
 def test_what_views_leave_out_changes_no_bit(scene: Scene) -> None:

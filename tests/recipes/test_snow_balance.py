@@ -191,3 +191,23 @@ def test_a_recipe_without_the_later_fields_has_snow_only_with_depth() -> None:
     assert not Snow(depth_m=0.0, placed_depth_m=0.1).has_effect
     assert Snow(depth_m=0.0, road=SnowRoad(wetness=0.5)).has_effect
     assert not Snow(depth_m=0.05).is_scaled
+
+
+def test_cover_of_a_road_grows_with_its_snow_and_not_with_its_water() -> None:
+    assert Snow(depth_m=0.05, coverage=0.7).road_cover == 0.7
+    assert Snow(depth_m=0.0).road_cover == 0
+    wet = SnowRoad(depth_m=0.0, wetness=1.0)
+    assert Snow(depth_m=0.02, road=wet).road_cover == 0
+    covers = [
+        Snow(depth_m=0.05, coverage=0.7, road=SnowRoad(depth_m=depth_m)).road_cover
+        for depth_m in (1e-5, 0.005, 1.0)
+    ]
+    assert covers == pytest.approx([0.0, 0.7 * (1 - math.exp(-1)), 0.7], abs=2e-3)
+
+
+def test_a_beam_ends_on_snow_that_lies_on_roads_alone() -> None:
+    assert Snow(depth_m=0.0, road=SnowRoad(depth_m=0.03)).beam_surface("first") == (
+        "snow 0.03 m deep",
+        True,
+    )
+    assert Snow(depth_m=0.0, road=SnowRoad(wetness=1.0)).beam_surface("first") is None

@@ -142,7 +142,7 @@ def make_light_plan(recipe: Recipe, scene: Scene, light: Light, hour: Hour) -> L
         has_drops=any(section is not None and section.has_effect for section in falling),
         extinction_per_m=section_at(recipe, "weather.smog.resolved_extinction_per_m") or 0.0,
         wetness=1.0 if recipe.weather.flood is not None else wetness,
-        snow_cover=snow.coverage if snow is not None and snow.has_effect else 0.0,
+        snow_cover=0.0 if snow is None else snow.road_cover,
         uses_color_map=bool(scene.color_mapped_cameras) and recipe.render.exposure != "neutral",
         needs_luminance=bool(recipe.output.labels) and scene.labels is not None,
         lamp_points=speed.lamp_points,

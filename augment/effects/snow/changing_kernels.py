@@ -26,9 +26,9 @@ BARE_BAND = 0.5  # change of the passes, in those that bare the road, over which
 MAX_TABLE_DEPTH_M = 0.05  # depth of the snow at the end of tables; deeper snow looks like it
 TABLES_PER_M = 1 / MAX_TABLE_DEPTH_M  # its reciprocal
 TABLE_SIZE = 1025  # number of values of a table
-# Shares of snow between which the scene's Gaussians beneath it fade.
-FADE_BEGIN = 0.35
-FADE_END = 0.93
+# Mean shares of snow between which the scene's Gaussians beneath it fade.
+FADE_BEGIN = 0.15
+FADE_END = 0.85
 
 
 class ChangingCells(NamedTuple):
@@ -275,7 +275,10 @@ def _scale_run(run, laid, floors, cell_ids, cells, state, tables, shares, scaled
 def fade_buried(
     runs, hideable_ids, covering_cells, cells, state, tables, shares, laid_opacities, opacities
 ):
-    """Fade the Gaussians that snow buries by the least share of it over them, in place.
+    """Fade the Gaussians that snow buries by the mean share of it over them, in place.
+
+    Gaussians are often larger than cells: one bare cell must not keep them whole, or they hide the
+    snow on all cells behind their centres.
 
     Args:
         runs: int64 [R, 2], first row and last row + 1 of `hideable_ids`.
@@ -325,12 +328,13 @@ def _fade_run(
     baring = cells.baring
     ridge = cells.ridge
     translucency = tables.translucency
+    num_cells = covering_cells.shape[1]
     for b in range(run[0], run[1]):
-        least = np.float32(1)
-        for k in range(covering_cells.shape[1]):
+        total = 0.0
+        for k in range(num_cells):
             cell_id = covering_cells[b, k]
             if cell_id < 0:
-                least = np.float32(0)
+                total = 0.0
                 break
             share = shares[cell_id]
             if share < 0:
@@ -346,12 +350,11 @@ def _fade_run(
                     translucency,
                 )
                 share = np.float32(exact_share)
-            least = min(least, share)
-            if least <= FADE_BEGIN:
-                break
-        if least > FADE_BEGIN:
+            total += share
+        mean = total / num_cells
+        if mean > FADE_BEGIN:
             n = hideable_ids[b]
-            fade = _smooth((least - FADE_BEGIN) / (FADE_END - FADE_BEGIN))
+            fade = _smooth((mean - FADE_BEGIN) / (FADE_END - FADE_BEGIN))
             opacities[n] = np.float32(laid_opacities[n] * (1.0 - fade))
 
 

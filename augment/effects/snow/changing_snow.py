@@ -73,10 +73,9 @@ from augment.scene.bounds import Bounds, may_show
 from augment.scene.cameras import Camera
 from augment.scene.scene import Gaussians, Scene
 from augment.scene.semantics import SemanticClass
-from recipes.snow import Snow
+from recipes.snow import HARD_COVERING_DEPTH_M, Snow
 
-# Depths at which all but 1/e of a surface is white, metres; all are judgement.
-HARD_COVERING_DEPTH_M = 0.005
+# Depth at which all but 1/e of grass is white, metres; judgement.
 GRASS_COVERING_DEPTH_M = 0.02
 # Octaves of the noise that orders the cells: (lattice step in metres, standard deviation).
 _ORDER_OCTAVES = ((2.6, 0.35), (1.1, 0.25), (0.45, 0.3), (0.19, 0.6), (0.08, 0.6))

@@ -154,14 +154,14 @@ class SnowEffect(Effect):
 
     def sun_share(self, recipe: Recipe, scene: Scene) -> tuple[float, str]:
         snow = self.section_of(recipe)
-        if snow is None or not (snow.has_effect or snow.placed_depth_m) or snow.sun_fade == 0:
+        if snow is None or not snow.is_laid or snow.sun_fade == 0:
             return 1.0, ""
         share = 1 - snow.sun_fade
         return share, f"{self.section} leaves {100 * share:.0f} % of the sun's light"
 
     def gloss_share(self, recipe: Recipe, scene: Scene) -> tuple[float, str]:
         snow = self.section_of(recipe)
-        if snow is None or not (snow.has_effect or snow.placed_depth_m) or snow.blue_fade == 0:
+        if snow is None or not snow.is_laid or snow.blue_fade == 0:
             return 1.0, ""
         share = 1 - snow.blue_fade
         return share, f"{self.section} leaves {100 * share:.0f} % of the sky's blue"
@@ -174,9 +174,7 @@ class SnowEffect(Effect):
         """Find the exposed surface of the scene, once for all recipes of the job."""
         sections = (self.section_of(recipe) for recipe in context.recipes)
         distinct = dict.fromkeys(
-            exposure_settings(snow, context.scene)
-            for snow in sections
-            if snow and (snow.has_effect or snow.placed_depth_m)
+            exposure_settings(snow, context.scene) for snow in sections if snow and snow.is_laid
         )
         for settings in distinct:
             precompute_shadows(context.scene)
