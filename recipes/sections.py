@@ -86,6 +86,11 @@ class Leaf:
     def is_number(self) -> bool:
         return self.kind in (int, float)
 
+    @property
+    def only_steps(self) -> bool:
+        """Return True if the field has no values between those of two points of a timeline."""
+        return self.kind is not float
+
     @cached_property
     def channel(self) -> Leaf | None:
         """Return the leaf of one of the three numbers of a colour or rates, or None for any
