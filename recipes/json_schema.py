@@ -112,7 +112,7 @@ def _ranges(leaf: Leaf, reference: dict[str, Any]) -> list[dict[str, Any]]:
 def _timeline(leaf: Leaf, time: dict[str, Any], value: dict[str, Any]) -> dict[str, Any]:
     """Return the schema of a timeline. time, value: the schemas of a point's parts."""
     points = {"type": "array", "items": _list(time, value), "minItems": 1}
-    shapes = SHAPE.allowed_words if leaf.kind is float else ("step",)
+    shapes = ("step",) if leaf.only_steps else SHAPE.allowed_words
     options = {"shape": {"enum": [*shapes]}, "times": {"enum": [*TIMES.allowed_words]}}
     return _mapping({TIMELINE: points}, **options)
 

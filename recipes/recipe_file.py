@@ -10,11 +10,12 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Container, Iterator, Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
 from pydantic_core import ErrorDetails
 
+from recipes.curve import Shape
 from recipes.errors import Place, Problems, dotted
 from recipes.fields import FilePath, Number
 from recipes.guesses import guess_section, guess_value, show, why_no_key, why_no_range
@@ -36,7 +37,7 @@ from recipes.ranges import (
 from recipes.schema import Recipe
 from recipes.sections import Leaf, Section, recipe_file
 from recipes.speed import MOVED_FIELDS
-from recipes.timeline import TIMELINE
+from recipes.timeline import TIMELINE, TimeUnit
 from recipes.yaml_tree import ListNode, MapNode, Node, ScalarNode, plain
 
 # Largest number of ranges whose values a message about a rule lists.
@@ -122,8 +123,8 @@ _MEAN = Leaf("mean", Annotated[Number, Field(allow_inf_nan=False)], rangeable=Fa
 _STD = Leaf("std", Annotated[Number, Field(gt=0, allow_inf_nan=False)], rangeable=False)
 # Parts of a timeline.
 TIME = Leaf("time", Annotated[Number, Field(ge=-1e7, le=1e7)])
-SHAPE = Leaf("shape", Literal["linear", "step", "smooth"], rangeable=False)
-TIMES = Leaf("times", Literal["seconds", "share"], rangeable=False)
+SHAPE = Leaf("shape", Shape, rangeable=False)
+TIMES = Leaf("times", TimeUnit, rangeable=False)
 _WEIGHT = Leaf("weight", Annotated[Number, Field(ge=0, le=1e9)], rangeable=False)
 
 Message = tuple[Place, str]
@@ -147,7 +148,8 @@ def _read_range(kind: str, node: MapNode, leaf: Leaf) -> Any:
         points = tuple(
             (_read_value(time, TIME), _read_value(value, leaf.point)) for time, value in body
         )
-        shape: Any = plain(node["shape"]) if "shape" in node else _default_shape(leaf)
+        default_shape = "step" if leaf.only_steps else "linear"
+        shape: Any = plain(node["shape"]) if "shape" in node else default_shape
         times: Any = plain(node["times"]) if "times" in node else "seconds"
         return Timeline(points, shape, times, str(node.place))
     if kind == "choice":
@@ -214,7 +216,7 @@ def _timeline_faults(node: MapNode, leaf: Leaf, location: Location) -> Iterator[
     for name, part in {"shape": SHAPE, "times": TIMES}.items():
         if name in node:
             yield from _value_faults(node[name], part, (*location, name))
-    if "shape" in node and _only_steps(leaf) and plain(node["shape"]) in ("linear", "smooth"):
+    if "shape" in node and leaf.only_steps and plain(node["shape"]) in ("linear", "smooth"):
         text = "must be step: whole numbers and words have nothing between them"
         yield _message(node["shape"], (*location, "shape"), text)
     if not isinstance(body, ListNode) or not body:
@@ -228,15 +230,6 @@ def _timeline_faults(node: MapNode, leaf: Leaf, location: Location) -> Iterator[
         yield from _value_faults(time, TIME, (*inside, i, 0))
         if _is_null(value):
             yield from _explain(value, leaf.point, (*inside, i, 1))
-
-
-def _only_steps(leaf: Leaf) -> bool:
-    """Return True if the field has no values between those of two points."""
-    return leaf.kind is not float
-
-
-def _default_shape(leaf: Leaf) -> str:
-    return "step" if _only_steps(leaf) else "linear"
 
 
 def _value_faults(node: Node, leaf: Leaf, location: Location) -> Iterator[Message]:

@@ -585,6 +585,8 @@ class Recipe(ClosedModel):
     def _surfaces(self) -> dict[str, bool]:
         """Return the weather's surfaces on which a beam can end, and whether depth images show
         each.
+
+        A surface that only the course of the weather makes has no number: it depends on the drive.
         """
         surfaces = {
             path: section.beam_surface(self.output.surface)
@@ -596,8 +598,11 @@ class Recipe(ClosedModel):
                 if None not in surfaces.values():
                     break
                 sections = self.at_weather_time(ANY_DRIVE, time_s).sections()
-                for path, surface in surfaces.items():
-                    surfaces[path] = surface or sections[path].beam_surface(self.output.surface)
+                for path in [path for path, surface in surfaces.items() if surface is None]:
+                    derived = sections[path].beam_surface(self.output.surface)
+                    if derived is not None:
+                        words = f"{path.rpartition('.')[2]} that changes over time"
+                        surfaces[path] = (words, derived[1])
         return dict(sorted(surface for surface in surfaces.values() if surface is not None))
 
     def sections(self) -> dict[str, EffectModel]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import operator
+import re
 import types
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -25,6 +26,8 @@ from recipes.ranges import RANGE_KINDS, is_number
 from recipes.schema import KNOBS, SECTIONS, Recipe, timeline_holders
 from recipes.timeline import TIMELINE
 
+# Index of an item in a dotted path.
+_INDEX = re.compile(r"\[[0-9]+\]")
 # Units in words, by the end of a field's name.
 UNITS = {
     "_per_m": "1/metre",
@@ -85,6 +88,11 @@ class Leaf:
     @property
     def is_number(self) -> bool:
         return self.kind in (int, float)
+
+    @property
+    def only_steps(self) -> bool:
+        """Return True if the field has no values between those of two points of a timeline."""
+        return self.kind is not float
 
     @cached_property
     def channel(self) -> Leaf | None:
@@ -260,6 +268,17 @@ class _EffectFields(ClosedModel):
 def recipe_file() -> Section:
     """Return the section of a whole recipe file, which holds all others."""
     return _recipe_file(tuple(SECTIONS.items()))
+
+
+def unit_of_field(path: str) -> str | None:
+    """Return the unit of a recipe's field in words; None for a pure number or an unknown path.
+
+    Args:
+        path: dotted path, in which items of lists have their index.
+    """
+    general_path = _INDEX.sub("[]", path)
+    leaves = (leaf for section in recipe_file().walk() for leaf in section.leaves.values())
+    return next((leaf.unit for leaf in leaves if leaf.path == general_path), None)
 
 
 @functools.lru_cache(2)

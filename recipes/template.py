@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,9 +12,8 @@ from recipes.errors import RecipeError, join, readable
 from recipes.files import with_digest
 from recipes.ranges import Draws, describe, draw, format_value, is_range
 from recipes.schema import VERSION, Recipe
-from recipes.sections import recipe_file
+from recipes.sections import recipe_file, unit_of_field
 
-_INDEX = re.compile(r"\[[0-9]+\]")
 _SHARE = ".probability"
 
 
@@ -89,14 +87,13 @@ class RecipeTemplate:
         """Return the range in words, with the unit, of every field that differs between
         variants, by path.
         """
-        units = {leaf.path: leaf.unit for s in recipe_file().walk() for leaf in s.leaves.values()}
         ranges = {
             path: f"present with probability {format_value(share)}"
             for path, share in self._shares.items()
         }
         for path, value in self.values.items():
             if is_range(value):
-                unit = units.get(_INDEX.sub("[]", path))
+                unit = unit_of_field(path)
                 ranges[path] = describe(value) + (f" ({unit})" if unit else "")
         return ranges
 

@@ -117,7 +117,7 @@ def _dry_run(job: GenerateJob) -> int:
         print(f"  taken as their mean: {', '.join(guess.unsampled_recipes)}")
     print(
         f"about {duration_text(guess.seconds)} of one worker, {size_text(guess.bytes)} "
-        f"(from one picture a recipe; right to a factor of two or so)"
+        f"(from two to four pictures a recipe; right to a factor of two or so)"
     )
     return 1 if plan.unusable else 0
 

@@ -79,7 +79,13 @@ def kernel_modules(
     }
     pictures = (f"augment.render.{name}" for name in ("cpu", "composite_kernels"))
     passes = ["augment.render.picture_kernels"] if any(map(_alters_picture, recipes)) else []
+    if any(map(_has_banks, recipes)):
+        passes.append("augment.render.fog_bank_kernels")
     return [*street, "augment.scene", *pictures, *passes, *sorted(folders)]
+
+
+def _has_banks(recipe: Recipe) -> bool:
+    return recipe.weather.smog is not None and recipe.weather.smog.patchiness > 0
 
 
 def _alters_picture(recipe: Recipe) -> bool:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import math
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ from augment.output.atomic import write_atomic
 from recipes.moment import SceneTimes
 from recipes.ranges import is_number
 from recipes.schema import Recipe, columns_of_effects
-from recipes.sections import recipe_file
+from recipes.sections import unit_of_field
 
 # Times of a picture's curves, beside the points of timelines.
 NUM_PLOTTED = 240
@@ -116,8 +115,7 @@ def unit_of(path: str) -> str:
     column = columns_of_effects().get(path)
     if column is not None and column.factor == 1 and column.numerator is None:
         return column.unit
-    leaf_units = {leaf.path: leaf.unit for s in recipe_file().walk() for leaf in s.leaves.values()}
-    return leaf_units.get(re.sub(r"\[[0-9]+\]", "[]", path)) or ""
+    return unit_of_field(path) or ""
 
 
 def write_course(path: Path, recipe: Recipe, times: SceneTimes, at_s: float | None = None) -> None:

@@ -37,6 +37,7 @@ from augment.photo.trust import judge_scene, source_views, unfitted_cameras
 from augment.scene.cameras import scaled_size
 from augment.scene.scene import Scene
 from augment.scene.scene_index import SceneIndex, has_lidar, select_frames
+from augment.scene.scene_times import times_of_drive
 from recipes.errors import RecipeError
 from recipes.job import ALL_CAMERAS, JobScene, SceneRecipes
 from recipes.moment import SceneTimes
@@ -115,9 +116,8 @@ class SceneRecord:
     @property
     def times(self) -> SceneTimes:
         """Times of the scene's images, by which its weather changes."""
-        images = [time for frame in self.frames for _, _, time in frame.cameras.values()]
-        times = images or [frame.timestamp_ns for frame in self.frames] or [0]
-        return SceneTimes(min(times), max(times), len(self.frames))
+        images = (time for frame in self.frames for _, _, time in frame.cameras.values())
+        return times_of_drive(images, [frame.timestamp_ns for frame in self.frames])
 
     def to_json(self) -> bytes:
         """Return the record as JSON."""

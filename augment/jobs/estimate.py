@@ -56,10 +56,11 @@ def estimate_job(
 ) -> Estimate:
     """Estimate time and size of a job from two to four pictures of each recipe.
 
-    The estimate is right to within a factor of about two. Both pictures show the middle frame of
-    the recipe's first scene in one camera, and their cost is scaled by the pixels of the job. The
-    time that the first picture takes beyond the second (snow placement, style maps, compiling)
-    counts once for each scene.
+    The estimate is right to within a factor of about two. The first picture and a second one
+    show the middle frame of the recipe's first scene in one camera; of a recipe that changes over
+    time the second one is the mean of the first, the middle and the last frame. Its cost is scaled
+    by the pixels of the job. The time that the first picture takes beyond it (snow placement, style
+    maps, compiling) counts once for each scene.
 
     Args:
         open_scene: Opens a scene by its URI.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+
 from augment.memo import memo_of
 from augment.scene.scene import Scene
 from recipes.moment import SceneTimes
@@ -16,7 +18,16 @@ def scene_times(scene: Scene) -> SceneTimes:
 
 
 def _find_times(scene: Scene) -> SceneTimes:
-    frames = scene.frames
-    images = [camera.timestamp_ns for frame in frames for camera in frame.cameras.values()]
-    times = images or [frame.timestamp_ns for frame in frames] or [0]
-    return SceneTimes(min(times), max(times), len(frames))
+    images = (camera.timestamp_ns for frame in scene.frames for camera in frame.cameras.values())
+    return times_of_drive(images, [frame.timestamp_ns for frame in scene.frames])
+
+
+def times_of_drive(images_ns: Iterable[int], frames_ns: Sequence[int]) -> SceneTimes:
+    """Return the times of a drive: those of its images, or of its frames if it has no images.
+
+    Args:
+        images_ns: times of all images, in any order.
+        frames_ns: times of all frames, in any order.
+    """
+    times = list(images_ns) or frames_ns or [0]
+    return SceneTimes(min(times), max(times), len(frames_ns))

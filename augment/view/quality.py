@@ -44,10 +44,6 @@ from recipes.speed import MOVED_FIELDS, former_path
 # ---- One picture, to measure its time and its error at the size of its reference -----------------
 
 
-# Largest number of views that are rendered because the weather is at an extreme then.
-MAX_EXTREMES = 5
-
-
 @dataclass(frozen=True, eq=False)
 class Trial:
     """A rendered view, enlarged or reduced to the size of the reference."""
@@ -105,6 +101,10 @@ def resize_picture(picture: np.ndarray, width: int, height: int) -> np.ndarray:
     shrinks = picture.shape[0] > height or picture.shape[1] > width
     interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
     return cv2.resize(picture, (width, height), interpolation=interpolation)
+
+
+# Largest number of views that are rendered because the weather is at an extreme then.
+MAX_EXTREMES = 5
 
 
 class CalibrationView(NamedTuple):

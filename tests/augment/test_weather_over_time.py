@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Hashable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from augment.dataset.live import SceneDataset
-from augment.effects import JobContext, precompute_effects
+from augment.effects import EFFECTS, JobContext, precompute_effects
 from augment.jobs.generate import plan_job, run_generate
 from augment.jobs.render_job import RenderJob
 from augment.output.manifest import read_manifest
@@ -210,6 +211,23 @@ def test_a_job_of_many_scenes_notes_each_images_time(tmp_path) -> None:
 
 def timestamp(row: dict) -> int:
     return row["timestamp_ns"]
+
+
+@pytest.mark.parametrize(
+    "weather",
+    [
+        "{snow: {depth_m: {timeline: [[0, 0], [0.3, 0.1]]}}}",
+        "{rain: {rate_mm_h: 0, wetness: {timeline: [[0, 0], [0.3, 1]]}}}",
+    ],
+)
+def test_weather_that_begins_later_is_warmed_up_too(weather: str) -> None:
+    dry, *later = recipe_of(weather).over_time(scene_times(open_fake("fake:street")))
+
+    def kernel_keys(recipe: Recipe) -> list[Hashable]:
+        sections = [(effect, effect.section_of(recipe)) for effect in EFFECTS]
+        return [effect.kernel_key(section) for effect, section in sections if section is not None]
+
+    assert all(kernel_keys(state) != kernel_keys(dry) for state in later)
 
 
 def test_a_timeline_beyond_the_drive_stops_a_job_before_it_renders() -> None:

@@ -188,6 +188,16 @@ def test_a_point_beyond_the_drive_is_refused_with_its_line() -> None:
     assert rain_at(rain("{timeline: [[0, 1], [8.1, 2]]}"), 0) == 1
 
 
+def test_the_note_of_snow_that_the_weather_makes_states_no_depth() -> None:
+    falling = "{timeline: [[0, 0], [1, 2]], times: share}"
+    recipe = recipe_of(
+        f"weather: {{snow: {{depth_m: 0}}, snowfall: {{rate_mm_h: {falling}}}, "
+        "air: {temperature_c: -2}}\noutput: {lidar: true}"
+    )
+    note = recipe.lidar_note("clean")
+    assert note is not None and note.startswith("snow that changes over time in images and depth")
+
+
 def test_shares_of_a_drive_of_one_frame_are_refused() -> None:
     still = SceneTimes(5, 5, 1)
     with pytest.raises(RecipeError, match="times: share"):

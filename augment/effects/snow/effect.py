@@ -101,7 +101,7 @@ class SnowEffect(Effect):
     )
 
     def kernel_key(self, section: Snow) -> Hashable:
-        return section.shading
+        return (section.shading, section.is_scaled) if section.has_effect else None
 
     def plan_in_scene(
         self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]

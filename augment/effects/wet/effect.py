@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -107,6 +107,9 @@ class WetEffect(Effect):
     raster_passes = (MIRROR_PASS,)
     precomputes_files = True
     kernel_folders = ("augment.exposure",)
+
+    def kernel_key(self, section: Rain) -> Hashable:
+        return section.road is not None if section.wets_ground else None
 
     def reads_splats(self, recipe: Recipe) -> bool:
         rain = self.section_of(recipe)
