@@ -23,7 +23,7 @@ from augment.scores.guards import (
     equal_picture_warnings,
     equal_score_warnings,
 )
-from augment.scores.half_recall import HalfRecall, find_half_recall
+from augment.scores.half_recall import Levels, find_half_recall
 from augment.scores.kitti_metric import KittiView
 from augment.scores.metric_values import (
     CocoMetric,
@@ -387,18 +387,13 @@ def _half_recall(run: _Run, effect: str) -> HalfRecallScore | None:
     if not run.hits or not facts[0].unit or len(values) < len(names):
         return None
     numbers = run.suite.numbers_of(effect)
-    half = find_half_recall(
+    return find_half_recall(
         np.stack([_hits_by_scene(run, name, numbers) for name in names], axis=1),
         _hits_by_scene(run, CLEAN_VARIANT, numbers),
         _objects_by_scene(run, numbers),
-        values,
-        facts[0].unit,
+        Levels(names, tuple(values), facts[0].unit),
         np.random.default_rng(BOOTSTRAP_SEED),
     )
-    if half is None:
-        return None
-    text = _half_text(half, values, facts[0].unit)
-    return HalfRecallScore(text=text, value=half.value, interval=half.interval)
 
 
 def _recall_interval(run: _Run, variant: str, numbers: Sequence[int]) -> tuple[float, float] | None:
@@ -431,13 +426,6 @@ def _sum_by_scene(run: _Run, numbers: Sequence[int], counts: list[int]) -> np.nd
     names = [run.suite.images[number].scene for number in numbers]
     _, places = np.unique(names, return_inverse=True)
     return np.bincount(places, weights=counts)
-
-
-def _half_text(half: HalfRecall, values: Sequence[float], unit: str) -> str:
-    """Return V50 as a text."""
-    if half.value is not None:
-        return f"{half.value:.3g} {unit}"
-    return f"{half.bound} than {values[0 if half.bound == 'milder' else -1]:g} {unit}"
 
 
 def _recall_bins(run: _Run, effect: str) -> RecallBins:

@@ -75,6 +75,16 @@ def test_recall_of_every_level_is_that_of_the_objects_that_were_written(suite, g
     assert not scores.warnings
 
 
+def test_half_recall_of_levels_with_one_number_names_the_levels(tmp_path):
+    suite = write_suite(tmp_path / "out", levels_m=(600.0, 300.0, 150.0, 75.0, 75.0))
+    top = write_coco(
+        tmp_path / "p", suite, lambda number, level: [0, 1, 2][: 3 if level < 4 else 6 - level]
+    )
+    half = score_suite(open_store(suite.path), top).effects["fog"].half_recall
+    assert half is not None
+    assert (half.text, half.value) == ("fog-5 but not fog-4, both 75 m", None)
+
+
 def test_objects_are_binned_by_the_transmittance_of_their_own_variant(suite, good_predictions):
     bins = score_suite(open_store(suite.path), good_predictions).recall_bins["fog"]
     counts = [(counted.objects, counted.num_found) for counted in bins.transmittance]
