@@ -247,6 +247,13 @@ def check_baseline(scores: SuiteScores, baseline: SuiteScores, where: str) -> li
             {name: record.effects[name].omitted_scenes for name in sorted(shared_effects)}
             for record in (scores, baseline)
         ),
+        "levels": tuple(
+            {
+                name: tuple(level.level for level in record.effects[name].levels)
+                for name in sorted(shared_effects)
+            }
+            for record in (scores, baseline)
+        ),
     }  # fmt: skip
     for name, (value, baseline_value) in facts.items():
         if value != baseline_value:
