@@ -191,7 +191,7 @@ def _open_run(suite: RenderedSuite, folder: Path, options: ScoreOptions) -> _Run
     kind = kinds[CLEAN_VARIANT]
     truth = read_truth(suite, options.categories) if kind in ("coco", "kitti") else None
     predictions = {
-        name: read_predictions(folder / name, _expected_images(suite, truth, name))
+        name: read_predictions(folder / name, kind, _expected_images(suite, truth, name))
         for name in variants
     }
     check_probes(suite, predictions)
@@ -474,10 +474,11 @@ def _recorded_value(run: _Run, folder: Path) -> float | None:
     if not (folder / RECORDED).is_dir():
         return None
     expected = _expected_images(run.suite, run.truth, CLEAN_VARIANT)
-    predictions = read_predictions(folder / RECORDED, expected)
     kind = run.predictions[CLEAN_VARIANT].kind
-    if predictions.kind != kind:
-        raise ScoreError(f"{folder / RECORDED} has {predictions.kind}, the variants have {kind}")
+    recorded_kind = find_kind(folder / RECORDED)
+    if recorded_kind != kind:
+        raise ScoreError(f"{folder / RECORDED} has {recorded_kind}, the variants have {kind}")
+    predictions = read_predictions(folder / RECORDED, kind, expected)
     return run.metric.measure(predictions, run.suite.numbers_of(None)).value
 
 

@@ -439,6 +439,7 @@ def test_interval_of_recall_is_that_of_scenes_and_not_of_boxes():
     assert low == pytest.approx(0.345, abs=0.02)
     assert high == pytest.approx(0.655, abs=0.02)
     assert recall_interval(hits[:1], hits[:1], np.random.default_rng(2)) is None
+    assert recall_interval(np.zeros(2), np.zeros(2), np.random.default_rng(2)) is None
 
 
 def test_bootstrap_interval_covers_the_truth_as_often_as_it_says():
