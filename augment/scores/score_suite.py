@@ -33,7 +33,13 @@ from augment.scores.metric_values import (
     NuScenesMetric,
     SemanticMetric,
 )
-from augment.scores.predictions import ExpectedImages, Predictions, find_kind, read_predictions
+from augment.scores.predictions import (
+    ExpectedImages,
+    PredictionKind,
+    Predictions,
+    find_kind,
+    read_predictions,
+)
 from augment.scores.recall import (
     RANGE_BOUNDS_M,
     SHARE_BOUNDS,
@@ -183,7 +189,7 @@ def _open_run(suite: RenderedSuite, folder: Path, options: ScoreOptions) -> _Run
             f"{folder} has folders that are no variant of {suite.name}: "
             f"{list_names(sorted(other_folders))}"
         )
-    kinds = {name: find_kind(folder / name) for name in variants}
+    kinds: dict[str, PredictionKind] = {name: find_kind(folder / name) for name in variants}
     if len(set(kinds.values())) > 1:
         by_kind = {kind: name for name, kind in kinds.items()}
         texts = ", ".join(f"{kind} in {name}" for kind, name in by_kind.items())
