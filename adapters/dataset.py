@@ -128,8 +128,12 @@ class Dataset:
         return _imported(self.labels)(path, query) if self.labels else None
 
     def scene_queries(self, path: str, query: dict[str, str]) -> list[dict[str, str]]:
-        """Return the query of each scene that a path and a query stand for."""
-        return _imported(self.list_scenes)(path, query) if self.list_scenes else [query]
+        """Return the query of each scene that a path and a query stand for.
+
+        A folder without scenes stands for itself: opening it says what is missing.
+        """
+        queries = _imported(self.list_scenes)(path, query) if self.list_scenes else []
+        return queries or [query]
 
     def recorded_conditions(self, path: str, query: dict[str, str]) -> tuple[str, ...]:
         """Return the conditions that the dataset states of a recording, sorted by name."""

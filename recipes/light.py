@@ -8,12 +8,17 @@ from pydantic import Field, model_validator
 
 from recipes.effect import Column, EffectModel
 from recipes.fields import Angle, ClosedModel, Digest, FilePath, Number, Unit
+from recipes.smog import MOR_DEPTH
 
 # Mean luminance of the sky by hour, cd/m2: pi times as many lux on level ground. 400 lx fall at
 # sunset and 3.4 lx at the dark end of civil twilight; dusk lies between. Over cities the night sky
 # has 0.02 to 0.1 cd/m2. By day the scene says how much sun there is.
 DUSK_LUMINANCE_CD_M2 = 3.0
 NIGHT_LUMINANCE_CD_M2 = 0.05
+# Distance over which less than 5 % of the light must arrive for `auto` to turn lamps on, metres.
+POOR_VISIBILITY_M = 500.0
+# Illuminance of level ground below which `auto` turns lamps on, lux.
+DIM_LUX = 1000.0
 # Largest number of lamps that a recipe lists.
 MAX_LISTED_LAMPS = 1000
 
@@ -168,3 +173,20 @@ class Light(EffectModel):
         """Return False by day without any lamp."""
         are_off = self.vehicles == "off" and self.own_beams == "off" and self.street != "on"
         return self.is_dark or not are_off or bool(self.lamps)
+
+
+def foul_weather(rain_mm_h: float, snowfall_mm_h: float, extinction_per_m: float) -> str:
+    """Return the weather that makes drivers turn on their lamps, in words; empty for none.
+
+    Args:
+        rain_mm_h: rate of rain.
+        snowfall_mm_h: rate of snowfall.
+        extinction_per_m: extinction of fog.
+    """
+    if rain_mm_h > 0:
+        return "it rains"
+    if snowfall_mm_h > 0:
+        return "it snows"
+    if extinction_per_m * POOR_VISIBILITY_M > MOR_DEPTH:
+        return f"less than 5 % of the light arrives over {POOR_VISIBILITY_M:g} m of fog"
+    return ""

@@ -15,6 +15,7 @@ from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+from recipes.light import DIM_LUX, foul_weather
 from recipes.smog import KOSCHMIEDER, MOR_DEPTH
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ OSI_ILLUMINATION = Scale(
 RAIN_EXTINCTION_PER_KM = 0.312
 RAIN_EXPONENT = 0.67
 # Extinction in snowfall of R mm/h of water is 3.0 R^0.41 per km, of flakes by Sekhon and Srivastava
-# (1970). The flakes of pictures are within 20 % of it up to 5 mm/h.
+# (1970). The flakes of pictures are within 18 % of it from 0.1 to 5 mm/h.
 SNOWFALL_EXTINCTION_PER_KM = 3.0
 SNOWFALL_EXPONENT = 0.41
 # Share of the light of street lamps that falls on a carriageway of CARRIAGEWAY_M, in the mean; of
@@ -298,6 +299,21 @@ def _has_street_lamps(light: Light) -> bool:
     return light.street == "on" or (light.street == "auto" and light.is_dark)
 
 
+def _has_vehicle_lamps(recipe: Recipe, light: Light) -> bool:
+    if light.vehicles != "auto":
+        return light.vehicles == "on"
+    rain = recipe.weather.rain
+    snowfall = recipe.weather.snowfall
+    smog = recipe.weather.smog
+    is_foul = foul_weather(
+        rain.rate_mm_h if rain else 0.0,
+        snowfall.rate_mm_h if snowfall else 0.0,
+        smog.resolved_extinction_per_m if smog else 0.0,
+    )
+    is_dim = light.sky_luminance is not None and math.pi * light.sky_luminance < DIM_LUX
+    return light.is_dark or bool(is_foul) or is_dim
+
+
 def _mor_of(smog: Smog | None) -> float | None:
     """Return the meteorological optical range in smog, metres; None without any."""
     if smog is None or smog.resolved_extinction_per_m <= 0:
@@ -412,8 +428,6 @@ def _openlabel_tags(
         tags.append(OpenLabelTag(name))
     if light is not None and _has_street_lamps(light):
         tags.append(OpenLabelTag("ArtificialStreetLighting"))
-    if light is not None and (
-        light.vehicles == "on" or (light.is_dark and light.vehicles != "off")
-    ):
+    if light is not None and _has_vehicle_lamps(recipe, light):
         tags.append(OpenLabelTag("ArtificialVehicleLighting"))
     return tuple(tags)

@@ -50,7 +50,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "lamps": ("augment.lamps",),
     "layers": ("augment.view.layers",),
     "effects": ("augment.effects",),
-    "output": ("augment.output",),
+    "output": ("augment.output", "augment.suite.suite_file"),
     "metrics": ("augment.metrics",),
     "view": ("augment.view",),
     "reconstruct": ("augment.reconstruct",),

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from adapters.base import expand_datasets, expand_job_scenes, open_scene
+from adapters.base import open_scene
 from adapters.scene_cache import scene_digest
 from augment.jobs.block_worker import JobWorkerSetup
 from augment.jobs.generate import default_scratch
@@ -16,17 +15,12 @@ from augment.suite.searched_weather import (
     search_range,
     search_weather,
 )
-from recipes.job import JobScene
-from recipes.load import read_overrides
 from recipes.suite import load_suite
-from recipes.yaml_tree import plain
-from tools.options import FITTED
 from tools.output import print_note, write_json
+from tools.suite import SUITE, changes_of, scenes_of
 
 if TYPE_CHECKING:
     from tools.cli import SuiteSearchOptions
-
-SUITE = "weather-c-v1"
 
 
 def search_suite(options: SuiteSearchOptions) -> int:
@@ -34,12 +28,6 @@ def search_suite(options: SuiteSearchOptions) -> int:
     suite = load_suite(SUITE)
     mildest, harshest = search_range(suite, options.effect)
     unit = suite.effects[options.effect].unit
-    overrides = read_overrides(options.overrides)
-    cameras = None if options.cameras == FITTED else tuple(options.cameras.split(","))
-    entries = [
-        JobScene.model_validate({"uri": uri, "frames": options.frames, "cameras": cameras})
-        for uri in options.scenes
-    ]
 
     def setup_of(folder: str) -> JobWorkerSetup:
         return JobWorkerSetup(
@@ -51,10 +39,10 @@ def search_suite(options: SuiteSearchOptions) -> int:
         )
 
     renderer = NumberRenderer(
-        scenes=expand_datasets(expand_job_scenes(entries, Path())),
+        scenes=scenes_of(options),
         setup_of=setup_of,
         out_dir=options.out,
-        changes={path: plain(node) for path, node in overrides.items()},
+        changes=changes_of(options),
         scale=options.scale,
         workers=options.workers,
     )

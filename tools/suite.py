@@ -21,11 +21,12 @@ from recipes.load import read_overrides
 from recipes.suite import load_suite
 from recipes.yaml_tree import plain
 from tools.generate import ended_by_sigterm, size_text
+from tools.options import FITTED
 from tools.output import duration_text, print_images, print_note
 from tools.warm_up import warm_up_for_workers
 
 if TYPE_CHECKING:
-    from tools.cli import SuiteOptions, SuitePlanOptions, SuiteSelection
+    from tools.cli import SuiteOptions, SuitePlanOptions, SuiteSearchOptions, SuiteSelection
 
 SUITE = "weather-c-v1"
 _MAX_PATHS = 20  # that are printed
@@ -134,23 +135,31 @@ def show_probes(out: str, variant: str | None) -> int:
     return 0
 
 
+def scenes_of(options: SuiteSelection | SuiteSearchOptions) -> list[JobScene]:
+    """Return the scenes that options name, with patterns and folders of scenes expanded."""
+    cameras = None if options.cameras == FITTED else tuple(options.cameras.split(","))
+    entries = [
+        JobScene.model_validate({"uri": uri, "frames": options.frames, "cameras": cameras})
+        for uri in options.scenes
+    ]
+    return expand_datasets(expand_job_scenes(entries, Path()))
+
+
+def changes_of(options: SuiteSelection | SuiteSearchOptions) -> dict[str, object]:
+    """Return the fields that options set, by dotted path."""
+    return {path: plain(node) for path, node in read_overrides(options.overrides).items()}
+
+
 def _run_of(
     options: SuiteSelection, out: str, *, backend: str, scratch: Path | None = None, **facts: Any
 ) -> SuiteRun:
     """Return the run that options ask for."""
     suite = load_suite(SUITE)
-    overrides = read_overrides(options.overrides)
-    changes = {path: plain(node) for path, node in overrides.items()}
     variants = suite.select(
         None if options.effects == "all" else options.effects.split(","),
         None if options.levels == "all" else [int(text) for text in options.levels.split(",")],
     )
-    cameras = None if options.cameras == "fitted" else tuple(options.cameras.split(","))
-    entries = [
-        JobScene.model_validate({"uri": uri, "frames": options.frames, "cameras": cameras})
-        for uri in options.scenes
-    ]
-    scenes = expand_datasets(expand_job_scenes(entries, Path()))
+    scenes = scenes_of(options)
     store = open_store(out)
     setup = JobWorkerSetup(
         store_uri=out if store.local_dir is None else store.uri,
@@ -160,7 +169,7 @@ def _run_of(
         scene_digest=scene_digest,
     )
     return SuiteRun(
-        suite_recipes(suite, variants, changes, scale=options.scale),
+        suite_recipes(suite, variants, changes_of(options), scale=options.scale),
         quarter_of(scenes) if options.quarter else scenes,
         setup,
         recorded_conditions,

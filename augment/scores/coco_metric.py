@@ -12,7 +12,7 @@ import numpy as np
 
 from augment.errors import ScoreError
 from augment.scores.predictions import ImageDetections
-from augment.scores.truth import ImageTruth
+from augment.scores.truth import ImageTruth, coco_annotations
 
 
 def coco_average_precision(
@@ -36,24 +36,13 @@ def coco_average_precision(
         raise ScoreError(
             "COCO's mAP needs pycocotools: pip install climategs[score], or pip install pycocotools"
         ) from error
-    objects = []
     results = []
-    for number, (truth, image_detections) in enumerate(zip(truths, detections, strict=True)):
-        for k in range(len(truth)):
-            left, top, right, bottom = truth.boxes[k].tolist()
-            objects.append({
-                "id": len(objects) + 1,
-                "image_id": number,
-                "category_id": int(truth.categories[k]),
-                "bbox": [left, top, right - left, bottom - top],
-                "area": float(truth.pixels[k]),
-                "iscrowd": int(truth.is_ignored[k]),
-            })  # fmt: skip
+    for number, image_detections in enumerate(detections):
         for k in range(len(image_detections)):
             left, top, right, bottom = image_detections.boxes[k].tolist()
             results.append({
                 "image_id": number,
-                "category_id": int(image_detections.categories[k]),
+                "category_id": int(image_detections.categories[k]) + 1,
                 "bbox": [left, top, right - left, bottom - top],
                 "score": float(image_detections.scores[k]),
             })  # fmt: skip
@@ -62,8 +51,8 @@ def coco_average_precision(
         coco.dataset = {
             "info": {},
             "images": [{"id": number} for number in range(len(truths))],
-            "annotations": objects,
-            "categories": [{"id": k, "name": str(k)} for k in range(num_categories)],
+            "annotations": coco_annotations(truths),
+            "categories": [{"id": k, "name": str(k)} for k in range(1, num_categories + 1)],
         }
         coco.createIndex()
         if not results:

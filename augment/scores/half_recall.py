@@ -1,34 +1,36 @@
 """V50: the physical number of an effect at which recall has halved against clear air.
 
-Recall is interpolated between neighbouring levels over the logarithm of the number. Intervals are
-those of a bootstrap by scene.
+Recall is interpolated between neighbouring levels over the logarithm of the number. Between two
+levels of the same number V50 has no value, and is stated in words. Intervals are those of a
+bootstrap by scene.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
 from augment.scores.scene_bootstrap import interval_ends, resample_scenes
+from augment.scores.suite_scores import HalfRecallScore
 
 # Place of a limit that is milder than the first level, or harsher than the last.
 MILDER = -np.inf
 HARSHER = np.inf
 
 
-@dataclass(frozen=True)
-class HalfRecall:
-    """The number at which recall has halved, with its interval."""
+class Levels(NamedTuple):
+    """Levels of an effect that are scored, mildest first."""
 
-    value: float | None
-    """The number; None if recall halves before the first level, or not by the last."""
-    bound: str
-    """`milder` if recall halves before the first level, `harsher` if not by the last, or empty."""
-    interval: tuple[str, str] | None
-    """Mildest and harshest end of the interval, as texts; None with a single scene."""
+    names: tuple[str, ...]
+    """Names of the variants, such as `fog-3`."""
+    values: tuple[float, ...]
+    """Physical number of each level, above 0; two levels may have the same."""
+    unit: str
+    """Unit of that number, for texts."""
 
 
 def half_places(
@@ -55,8 +57,17 @@ def half_places(
     return np.where(is_below.any(axis=1), places, HARSHER)
 
 
-def value_at(place: float, values: Sequence[float]) -> float:
-    """Return the number at a place between levels, by the logarithm."""
+def value_at(place: float, values: Sequence[float]) -> float | None:
+    """Return the number at a place between levels, by the logarithm.
+
+    None outside the levels, and between two levels of the same number: they differ in something
+    else, which the number does not tell.
+    """
+    if not math.isfinite(place):
+        return None
+    upper = math.ceil(place)
+    if upper > 0 and values[upper - 1] == values[upper]:
+        return None
     logarithms = np.log(np.asarray(values, np.float64))
     return float(np.exp(np.interp(place, np.arange(len(values)), logarithms)))
 
@@ -65,18 +76,16 @@ def find_half_recall(
     hits: Float64[np.ndarray, "S L"],
     clean_hits: Float64[np.ndarray, " S"],
     num_objects: Float64[np.ndarray, " S"],
-    values: Sequence[float],
-    unit: str,
+    levels: Levels,
     rng: np.random.Generator,
-) -> HalfRecall | None:
+) -> HalfRecallScore | None:
     """Return V50 of one effect; None if nothing is found in clear air.
 
     Args:
         hits: Number of objects that are found, by scene and level.
         clean_hits: Number of objects that are found in clear air, by scene.
         num_objects: Number of objects by scene.
-        values: Physical number of each level, above 0.
-        unit: Unit of that number, for texts.
+        levels: The levels.
     """
     if not clean_hits.sum():
         return None
@@ -86,22 +95,30 @@ def find_half_recall(
     count = np.maximum(weights @ num_objects, 1)
     clean_recalls = weights @ clean_hits / count
     places = half_places(clean_recalls, weights @ hits / count[:, None])
-    place = float(places[0])
     interval = None
     if len(hits) > 1:
         milder, harsher = interval_ends(places[1:][clean_recalls[1:] > 0])
-        interval = (place_text(milder, values, unit), place_text(harsher, values, unit))
-    return HalfRecall(
-        value=value_at(place, values) if np.isfinite(place) else None,
-        bound="" if np.isfinite(place) else "milder" if place < 0 else "harsher",
-        interval=interval,
+        interval = (place_text(milder, levels), place_text(harsher, levels))
+    place = float(places[0])
+    return HalfRecallScore(
+        text=place_text(place, levels), value=value_at(place, levels.values), interval=interval
     )
 
 
-def place_text(place: float, values: Sequence[float], unit: str) -> str:
+def place_text(place: float, levels: Levels) -> str:
     """Return a place between levels as a text with its unit."""
+    values = levels.values
     if place == MILDER:
-        return f"milder than {values[0]:g} {unit}"
+        return f"milder than {values[0]:g} {levels.unit}"
     if place == HARSHER:
-        return f"harsher than {values[-1]:g} {unit}"
-    return f"{value_at(place, values):.3g} {unit}"
+        last = f"{values[-1]:g} {levels.unit}"
+        is_alone = values.count(values[-1]) == 1
+        return f"harsher than {last}" if is_alone else f"harsher than {levels.names[-1]}, {last}"
+    value = value_at(place, values)
+    if value is not None:
+        return f"{value:.3g} {levels.unit}"
+    upper = math.ceil(place)
+    return (
+        f"{levels.names[upper]} but not {levels.names[upper - 1]}, both "
+        f"{values[upper]:g} {levels.unit}"
+    )

@@ -26,22 +26,29 @@ def box_overlaps(
     boxes: Float64[np.ndarray, "N 4"], other_boxes: Float64[np.ndarray, "T 4"]
 ) -> Float64[np.ndarray, "N T"]:
     """Return the intersection over union of boxes left, top, right, bottom."""
-    lower = np.maximum(boxes[:, None, :2], other_boxes[None, :, :2])
-    upper = np.minimum(boxes[:, None, 2:], other_boxes[None, :, 2:])
-    shared_area = np.prod(np.maximum(upper - lower, 0.0), axis=2)
-    area = np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
-    other_area = np.prod(other_boxes[:, 2:] - other_boxes[:, :2], axis=1)
-    return shared_area / (area[:, None] + other_area[None] - shared_area)
+    shared_area = _shared_areas(boxes, other_boxes)
+    return shared_area / (_areas(boxes)[:, None] + _areas(other_boxes)[None] - shared_area)
 
 
 def covered_shares(
     boxes: Float64[np.ndarray, "N 4"], regions: Float64[np.ndarray, "T 4"]
 ) -> Float64[np.ndarray, "N T"]:
     """Return the share of each box that lies inside each region."""
-    lower = np.maximum(boxes[:, None, :2], regions[None, :, :2])
-    upper = np.minimum(boxes[:, None, 2:], regions[None, :, 2:])
-    shared_area = np.prod(np.maximum(upper - lower, 0.0), axis=2)
-    return shared_area / np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)[:, None]
+    return _shared_areas(boxes, regions) / _areas(boxes)[:, None]
+
+
+def _areas(boxes: Float64[np.ndarray, "N 4"]) -> Float64[np.ndarray, " N"]:
+    """Return the area of each box."""
+    return np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
+
+
+def _shared_areas(
+    boxes: Float64[np.ndarray, "N 4"], other_boxes: Float64[np.ndarray, "T 4"]
+) -> Float64[np.ndarray, "N T"]:
+    """Return the area that each box shares with each of the others."""
+    lower = np.maximum(boxes[:, None, :2], other_boxes[None, :, :2])
+    upper = np.minimum(boxes[:, None, 2:], other_boxes[None, :, 2:])
+    return np.prod(np.maximum(upper - lower, 0.0), axis=2)
 
 
 def assign_detections(

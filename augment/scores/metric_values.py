@@ -144,7 +144,8 @@ class SemanticMetric:
 
     def _count_image(self, predictions: Predictions, number: int) -> np.ndarray:
         """Return the pixels of an image by true and predicted class."""
-        path = self.suite.rows[CLEAN_VARIANT][number]["semantic_path"]
+        row = self.suite.rows[CLEAN_VARIANT][number]
+        path = row["semantic_path"]
         if path is None:
             raise ScoreError(
                 f"{self.suite.store.uri}: {CLEAN_VARIANT} has no semantic images to compare with; "
@@ -152,7 +153,8 @@ class SemanticMetric:
             )
         true_classes = decode_png(self.suite.store.read(path), np.uint8)
         try:
-            return count_pixels(true_classes, predictions.class_image(number))
+            predicted_classes = predictions.class_image(number, (row["width"], row["height"]))
+            return count_pixels(true_classes, predicted_classes)
         except ValueError as error:
             raise ScoreError(f"{predictions.folder}: image {number:06d}: {error}") from error
 

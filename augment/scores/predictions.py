@@ -25,6 +25,7 @@ from jaxtyping import Float64, Int64
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from augment.errors import ScoreError
+from augment.files.image_size import image_header
 from augment.output.atomic import read_file
 from augment.output.codecs import decode_png
 from augment.scores.suite_facts import ImageKey, list_names
@@ -42,6 +43,8 @@ DONT_CARE = "DontCare"
 NUM_KITTI_COLUMNS = 16
 # Value of a pixel of which a network says nothing.
 NO_CLASS = 255
+# Number of first bytes of a file of results in which its first character is looked for.
+_NUM_FIRST_BYTES = 1024
 
 
 class Meta(BaseModel):
@@ -95,11 +98,24 @@ class Predictions:
         has_boxes = self.kind in ("coco", "kitti")
         return has_boxes and not any(len(image) for image in self.detections)
 
-    def class_image(self, number: int) -> np.ndarray:
-        """Return the classes that are predicted for an image, uint8 [H, W]."""
+    def class_image(self, number: int, size: tuple[int, int]) -> np.ndarray:
+        """Return the classes that are predicted for an image, uint8 [H, W].
+
+        Args:
+            number: The image's number.
+            size: Width and height that the image must have, pixels. A file that states another size
+                is not decoded: a few bytes may state a gigabyte.
+        """
         path = self.folder / SEMANTIC_FOLDER / f"{number:06d}.png"
         try:
-            return decode_png(read_file(path), np.uint8)
+            data = read_file(path)
+            header = image_header(data)
+            if header is not None and header.size != size:
+                raise ScoreError(
+                    f"{self.folder}: image {number:06d}: expected {size[0]} x {size[1]} pixels; "
+                    f"got {header.width} x {header.height}"
+                )
+            return decode_png(data, np.uint8)
         except (OSError, ValueError) as error:
             raise ScoreError(f"{path} is no 8-bit PNG of classes: {error}") from error
 
@@ -116,13 +132,17 @@ class ExpectedImages:
     """Names of the categories; none where nothing is detected."""
 
 
-def read_predictions(folder: Path, expected: ExpectedImages) -> Predictions:
+def read_predictions(folder: Path, kind: PredictionKind, expected: ExpectedImages) -> Predictions:
     """Return the predictions in a variant's folder.
 
+    Args:
+        folder: The folder.
+        kind: Format of its predictions, by `find_kind`.
+        expected: Images and categories that they may name.
+
     Raises:
-        ScoreError: The folder has no predictions or several kinds, or they do not fit the suite.
+        ScoreError: The predictions do not fit the suite.
     """
-    kind = find_kind(folder)
     meta = _read_meta(folder)
     if kind == "semantic":
         content_hash = _check_folder(folder / SEMANTIC_FOLDER, ".png", expected)
@@ -143,21 +163,14 @@ def read_predictions(folder: Path, expected: ExpectedImages) -> Predictions:
 def find_kind(folder: Path) -> PredictionKind:
     """Return the format of the predictions in a variant's folder.
 
+    COCO's results are told by their first character: the list may be long, and is read later.
+
     Raises:
         ScoreError: There are none, or several.
     """
     kinds: list[PredictionKind] = []
     if (folder / RESULTS_FILE).is_file():
-        content = _read_json(folder / RESULTS_FILE)
-        if isinstance(content, list):
-            kinds.append("coco")
-        elif isinstance(content, dict) and isinstance(content.get("results"), dict):
-            kinds.append("nuscenes")
-        else:
-            raise ScoreError(
-                f"{folder / RESULTS_FILE} is neither COCO's results (a list of detections) nor "
-                f"nuScenes' (an object with `results`)"
-            )
+        kinds.append(_kind_of_results(folder / RESULTS_FILE))
     if (folder / KITTI_FOLDER).is_dir():
         kinds.append("kitti")
     if (folder / SEMANTIC_FOLDER).is_dir():
@@ -169,6 +182,22 @@ def find_kind(folder: Path) -> PredictionKind:
             f"{SEMANTIC_FOLDER}/000000.png"
         )
     return kinds[0]
+
+
+def _kind_of_results(path: Path) -> PredictionKind:
+    """Return the format of a file of results."""
+    with path.open("rb") as file:
+        if file.read(_NUM_FIRST_BYTES).lstrip().startswith(b"["):
+            return "coco"
+    content = _read_json(path)
+    if isinstance(content, list):
+        return "coco"
+    if isinstance(content, dict) and isinstance(content.get("results"), dict):
+        return "nuscenes"
+    raise ScoreError(
+        f"{path} is neither COCO's results (a list of detections) nor nuScenes' (an object with "
+        f"`results`)"
+    )
 
 
 def read_coco(
@@ -193,7 +222,7 @@ def read_coco(
             left, top, width, height = (float(value) for value in entry["bbox"])
             score = float(entry["score"])
             is_finite = all(map(math.isfinite, (left, top, width, height, score)))
-        except (LookupError, TypeError, ValueError) as error:
+        except (LookupError, OverflowError, TypeError, ValueError) as error:
             raise ScoreError(
                 f"{path}: entry {k} is no detection of COCO with image_id, category_id, bbox and "
                 f"score: {error!r:.200}"
@@ -323,7 +352,7 @@ def _check_nuscenes(path: Path, results: Mapping[str, Any]) -> None:
                     box["detection_score"],
                 ]
                 is_usable = len(numbers) == 11 and all(math.isfinite(float(n)) for n in numbers)
-            except (LookupError, TypeError, ValueError):
+            except (LookupError, OverflowError, TypeError, ValueError):
                 is_usable = False
             if not is_usable:
                 wrong.append(f"sample {token}, box {k}")

@@ -33,13 +33,15 @@ def recall_interval(
     num_objects: Float64[np.ndarray, " S"],
     rng: np.random.Generator,
 ) -> tuple[float, float] | None:
-    """Return the interval of the share of objects that are found; None with a single scene.
+    """Return the interval of the share of objects that are found.
+
+    None with a single scene, and without objects.
 
     Args:
         hits: Number of objects that are found, by scene.
         num_objects: Number of objects, by scene.
     """
-    if len(hits) < 2:
+    if len(hits) < 2 or not num_objects.any():
         return None
     weights = resample_scenes(len(hits), rng)
     count = weights @ num_objects

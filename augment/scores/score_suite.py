@@ -23,7 +23,7 @@ from augment.scores.guards import (
     equal_picture_warnings,
     equal_score_warnings,
 )
-from augment.scores.half_recall import HalfRecall, find_half_recall
+from augment.scores.half_recall import Levels, find_half_recall
 from augment.scores.kitti_metric import KittiView
 from augment.scores.metric_values import (
     CocoMetric,
@@ -33,7 +33,13 @@ from augment.scores.metric_values import (
     NuScenesMetric,
     SemanticMetric,
 )
-from augment.scores.predictions import ExpectedImages, Predictions, find_kind, read_predictions
+from augment.scores.predictions import (
+    ExpectedImages,
+    PredictionKind,
+    Predictions,
+    find_kind,
+    read_predictions,
+)
 from augment.scores.recall import (
     RANGE_BOUNDS_M,
     SHARE_BOUNDS,
@@ -183,7 +189,7 @@ def _open_run(suite: RenderedSuite, folder: Path, options: ScoreOptions) -> _Run
             f"{folder} has folders that are no variant of {suite.name}: "
             f"{list_names(sorted(other_folders))}"
         )
-    kinds = {name: find_kind(folder / name) for name in variants}
+    kinds: dict[str, PredictionKind] = {name: find_kind(folder / name) for name in variants}
     if len(set(kinds.values())) > 1:
         by_kind = {kind: name for name, kind in kinds.items()}
         texts = ", ".join(f"{kind} in {name}" for kind, name in by_kind.items())
@@ -191,7 +197,7 @@ def _open_run(suite: RenderedSuite, folder: Path, options: ScoreOptions) -> _Run
     kind = kinds[CLEAN_VARIANT]
     truth = read_truth(suite, options.categories) if kind in ("coco", "kitti") else None
     predictions = {
-        name: read_predictions(folder / name, _expected_images(suite, truth, name))
+        name: read_predictions(folder / name, kind, _expected_images(suite, truth, name))
         for name in variants
     }
     check_probes(suite, predictions)
@@ -387,18 +393,13 @@ def _half_recall(run: _Run, effect: str) -> HalfRecallScore | None:
     if not run.hits or not facts[0].unit or len(values) < len(names):
         return None
     numbers = run.suite.numbers_of(effect)
-    half = find_half_recall(
+    return find_half_recall(
         np.stack([_hits_by_scene(run, name, numbers) for name in names], axis=1),
         _hits_by_scene(run, CLEAN_VARIANT, numbers),
         _objects_by_scene(run, numbers),
-        values,
-        facts[0].unit,
+        Levels(names, tuple(values), facts[0].unit),
         np.random.default_rng(BOOTSTRAP_SEED),
     )
-    if half is None:
-        return None
-    text = _half_text(half, values, facts[0].unit)
-    return HalfRecallScore(text=text, value=half.value, interval=half.interval)
 
 
 def _recall_interval(run: _Run, variant: str, numbers: Sequence[int]) -> tuple[float, float] | None:
@@ -431,13 +432,6 @@ def _sum_by_scene(run: _Run, numbers: Sequence[int], counts: list[int]) -> np.nd
     names = [run.suite.images[number].scene for number in numbers]
     _, places = np.unique(names, return_inverse=True)
     return np.bincount(places, weights=counts)
-
-
-def _half_text(half: HalfRecall, values: Sequence[float], unit: str) -> str:
-    """Return V50 as a text."""
-    if half.value is not None:
-        return f"{half.value:.3g} {unit}"
-    return f"{half.bound} than {values[0 if half.bound == 'milder' else -1]:g} {unit}"
 
 
 def _recall_bins(run: _Run, effect: str) -> RecallBins:
@@ -486,10 +480,11 @@ def _recorded_value(run: _Run, folder: Path) -> float | None:
     if not (folder / RECORDED).is_dir():
         return None
     expected = _expected_images(run.suite, run.truth, CLEAN_VARIANT)
-    predictions = read_predictions(folder / RECORDED, expected)
     kind = run.predictions[CLEAN_VARIANT].kind
-    if predictions.kind != kind:
-        raise ScoreError(f"{folder / RECORDED} has {predictions.kind}, the variants have {kind}")
+    recorded_kind = find_kind(folder / RECORDED)
+    if recorded_kind != kind:
+        raise ScoreError(f"{folder / RECORDED} has {recorded_kind}, the variants have {kind}")
+    predictions = read_predictions(folder / RECORDED, kind, expected)
     return run.metric.measure(predictions, run.suite.numbers_of(None)).value
 
 

@@ -14,16 +14,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, ValidationError
-
-from augment.errors import OutputError, ScoreError
+from augment.errors import ScoreError
 from augment.output.manifest import OK, read_manifest_rows
-from augment.output.store import Store, StoredFileMissing
+from augment.output.store import Store
+from augment.suite.suite_file import SuiteFile, read_suite_file
+from recipes.suite import CLEAN, SuiteVariant
 
-# Name of the file that describes a suite.
-SUITE_FILE = "suite.json"
 # Name of the variant without weather.
-CLEAN_VARIANT = "clean-0"
+CLEAN_VARIANT = SuiteVariant(CLEAN, 0).name
 # Number of names that a message lists.
 MAX_NAMES = 5
 
@@ -34,51 +32,6 @@ _COLUMNS = (
 )
 
 Row = Mapping[str, Any]
-
-
-class VariantEntry(BaseModel):
-    """Facts of a variant, as `suite.json` states them."""
-
-    model_config = ConfigDict(frozen=True)
-
-    effect: str
-    """Name of the effect; `clean` at level 0."""
-    level: int
-    """Level, 0 for the clean render."""
-    number: str = ""
-    """Name of the effect's physical number."""
-    unit: str = ""
-    """Unit of that number."""
-    value: float | None = None
-    """The number at this level; None for the clean render."""
-    probes: tuple[str, ...]
-    """Paths of the images by which a user's loader is probed."""
-
-
-class SceneEntry(BaseModel):
-    """Facts of a scene, as `suite.json` states them."""
-
-    model_config = ConfigDict(frozen=True)
-
-    omitted_effects: tuple[str, ...] = ()
-    """Effects that the recording has already: the scene counts in no score of theirs."""
-
-
-class SuiteEntries(BaseModel):
-    """The part of `suite.json` that scores read."""
-
-    model_config = ConfigDict(frozen=True)
-
-    format: int
-    """Version of the file's format."""
-    suite: str
-    """Name of the suite, with its version."""
-    variants: dict[str, VariantEntry]
-    """Variants by name, such as `fog-3`."""
-    scenes: dict[str, SceneEntry]
-    """Scenes by name."""
-    files: dict[str, str]
-    """SHA-256 of every file, by path."""
 
 
 class ImageKey(NamedTuple):
@@ -98,7 +51,7 @@ class RenderedSuite:
 
     store: Store
     """The output."""
-    entries: SuiteEntries
+    entries: SuiteFile
     """Content of its `suite.json`."""
     content_hash: str
     """SHA-256 of that content."""
@@ -154,7 +107,7 @@ def read_suite(store: Store) -> RenderedSuite:
         OutputError: There is no finished suite, or a file is damaged.
         ScoreError: The suite has no clean variant, or no image in all variants.
     """
-    entries, content_hash = _read_entries(store)
+    entries = read_suite_file(store)
     if CLEAN_VARIANT not in entries.variants:
         raise ScoreError(
             f"{store.uri}: the suite has no {CLEAN_VARIANT}, and every score is relative to it; "
@@ -179,37 +132,11 @@ def read_suite(store: Store) -> RenderedSuite:
     return RenderedSuite(
         store,
         entries,
-        content_hash,
+        entries.content_hash,
         tuple(images),
         {name: tuple(variant_rows[k] for k in images) for name, variant_rows in rows.items()},
         tuple(sorted(all_images - set(images))),
     )
-
-
-def _read_entries(store: Store) -> tuple[SuiteEntries, str]:
-    """Return the content of an output's `suite.json` and its SHA-256."""
-    name = f"{store.uri}/{SUITE_FILE}"
-    try:
-        fields = json.loads(store.read(SUITE_FILE))
-        stated_hash = fields.pop("sha256")
-        entries = SuiteEntries.model_validate(fields)
-    except StoredFileMissing:
-        raise OutputError(
-            f"{store.uri} holds no {SUITE_FILE}: no suite was rendered there, or it is not finished"
-        ) from None
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        text = str(error.errors()[:3]) if isinstance(error, ValidationError) else repr(error)
-        raise OutputError(f"{name} is damaged: {text:.300}") from error
-    if entries.format != 1:
-        raise OutputError(f"{name} has format {entries.format}; this version reads format 1")
-    text = json.dumps(fields, sort_keys=True, separators=(",", ":"))
-    content_hash = hashlib.sha256(text.encode()).hexdigest()
-    if stated_hash != content_hash:
-        raise OutputError(
-            f"{name} was changed after it was written: its content has the SHA-256 {content_hash}, "
-            f"and it states {stated_hash!r}"
-        )
-    return entries, content_hash
 
 
 def list_names(names: Iterable[object]) -> str:

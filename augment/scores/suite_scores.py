@@ -46,9 +46,10 @@ class HalfRecallScore(_Closed):
     """V50: the physical number at which recall has halved."""
 
     text: str
-    """The number with its unit, or on which side of the levels it lies."""
+    """The number with its unit, or on which side of the levels it lies, or between which levels of
+    the same number."""
     value: float | None
-    """The number; None if it lies outside the levels."""
+    """The number; None if it lies outside the levels, or between two of the same number."""
     interval: tuple[str, str] | None
     """Its interval of 95 %, a bootstrap by scene; None with a single scene."""
 
@@ -244,6 +245,13 @@ def check_baseline(scores: SuiteScores, baseline: SuiteScores, where: str) -> li
         "images (scenes, frames and cameras)": (scores.images_sha256, baseline.images_sha256),
         "scenes that do not count": tuple(
             {name: record.effects[name].omitted_scenes for name in sorted(shared_effects)}
+            for record in (scores, baseline)
+        ),
+        "levels": tuple(
+            {
+                name: tuple(level.level for level in record.effects[name].levels)
+                for name in sorted(shared_effects)
+            }
             for record in (scores, baseline)
         ),
     }  # fmt: skip

@@ -197,14 +197,10 @@ def read_transmittances(
     return shares
 
 
-def coco_truth(suite: RenderedSuite, truth: SuiteTruth, variant: str) -> dict[str, Any]:
-    """Return the truth as a COCO file, with the image paths of a variant.
-
-    Ignored objects have `iscrowd: 1`. `id` of an image is its number, of a category its place from
-    1 on.
-    """
+def coco_annotations(images: Sequence[ImageTruth]) -> list[dict[str, Any]]:
+    """Return the objects of images as annotations of COCO, numbered as of `coco_truth`."""
     annotations: list[dict[str, Any]] = []
-    for number, image in enumerate(truth.images):
+    for number, image in enumerate(images):
         for k in range(len(image)):
             left, top, right, bottom = image.boxes[k].tolist()
             annotations.append({
@@ -215,6 +211,15 @@ def coco_truth(suite: RenderedSuite, truth: SuiteTruth, variant: str) -> dict[st
                 "area": int(image.pixels[k]),
                 "iscrowd": int(image.is_ignored[k]),
             })  # fmt: skip
+    return annotations
+
+
+def coco_truth(suite: RenderedSuite, truth: SuiteTruth, variant: str) -> dict[str, Any]:
+    """Return the truth as a COCO file, with the image paths of a variant.
+
+    Ignored objects have `iscrowd: 1`. `id` of an image is its number, of a category its place from
+    1 on.
+    """
     return {
         "info": {"suite": suite.name, "variant": variant},
         "images": [
@@ -227,6 +232,6 @@ def coco_truth(suite: RenderedSuite, truth: SuiteTruth, variant: str) -> dict[st
             }
             for number, image in enumerate(suite.images)
         ],
-        "annotations": annotations,
+        "annotations": coco_annotations(truth.images),
         "categories": [{"id": k, "name": name} for k, name in enumerate(truth.categories, start=1)],
     }

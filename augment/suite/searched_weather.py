@@ -97,29 +97,31 @@ def _searchable(suite: Suite, effect: str) -> tuple[tuple[SuiteLevel, ...], list
     """Return the levels of an effect, and the paths of the fields that change with its number."""
     if effect not in suite.effects:
         suite.select([effect])  # refuses it by name
-    levels = suite.effects[effect].levels
-    fields = [_flat(level.set) for level in levels]
-    values = [level.value for level in levels]
-    rises = sorted(values) in (values, values[::-1]) and len({*values}) == len(values)
-    is_alike = all(f.keys() == fields[0].keys() for f in fields) and not any(x.of for x in levels)
-    changing = [path for path in fields[0] if is_alike and len({str(f[path]) for f in fields}) > 1]
-    if not changing or not rises or not all(_is_number(f[p]) for f in fields for p in changing):
-        searchable = ", ".join(name for name in suite.effects if _is_searchable(suite, name))
+    paths = _changing_paths(suite, effect)
+    if not paths:
+        searchable = ", ".join(name for name in suite.effects if _changing_paths(suite, name))
         raise SearchError(
             f"{effect} of {suite.name} cannot be searched: its levels differ in more than a "
             f"number. {searchable} can"
         )
-    return levels, changing
+    return suite.effects[effect].levels, paths
 
 
-def _is_searchable(suite: Suite, effect: str) -> bool:
+def _changing_paths(suite: Suite, effect: str) -> list[str]:
+    """Return the paths of the fields that change with an effect's number.
+
+    There are none if the levels differ in anything else, or their numbers do not rise or fall from
+    level to level.
+    """
     levels = suite.effects[effect].levels
     fields = [_flat(level.set) for level in levels]
-    return (
-        not any(level.of for level in levels)
-        and all(f.keys() == fields[0].keys() for f in fields)
-        and all(_is_number(f[p]) or f[p] == fields[0][p] for f in fields for p in f)
-    )
+    values = [level.value for level in levels]
+    is_monotone = sorted({*values}) in (values, values[::-1])
+    is_alike = all(f.keys() == fields[0].keys() for f in fields) and not any(x.of for x in levels)
+    if not (is_monotone and is_alike):
+        return []
+    paths = [path for path in fields[0] if any(f[path] != fields[0][path] for f in fields)]
+    return paths if all(_is_number(f[path]) for f in fields for path in paths) else []
 
 
 def _is_number(value: object) -> bool:

@@ -149,10 +149,11 @@ class SuiteFile(_Closed):
             fields = json.loads(data)
             stated_hash = fields.pop("sha256")
             suite_file = SuiteFile.model_validate(fields)
-        if stated_hash != suite_file.content_hash:
+        content_hash = suite_file.content_hash
+        if stated_hash != content_hash:
             raise OutputError(
                 f"{source_name} was changed after it was written: its content has the SHA-256 "
-                f"{suite_file.content_hash}, and it states {stated_hash}. {advice}"
+                f"{content_hash}, and it states {stated_hash}. {advice}"
             )
         return suite_file
 
@@ -217,18 +218,15 @@ def describe_suite(store: Store, request: SuiteRequest) -> SuiteFile:
     Raises:
         OutputError: A file of the manifest is missing, or nothing is finished.
     """
-    rows = [
-        row
-        for row in read_manifest_rows(store).to_pylist()
-        if _variant_of(request.suite, row["recipe"]) is not None
-    ]
+    all_names = [variant.name for variant in request.suite.variants]
+    rows = [row for row in read_manifest_rows(store).to_pylist() if row["recipe"] in all_names]
     ok_rows = [row for row in rows if row["status"] == OK]
     rows_by_variant: defaultdict[str, list[dict[str, Any]]] = defaultdict(list)
     rows_by_scene: defaultdict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in ok_rows:
         rows_by_variant[row["recipe"]].append(row)
         rows_by_scene[row["scene"]].append(row)
-    names = [variant.name for variant in request.suite.variants if variant.name in rows_by_variant]
+    names = [name for name in all_names if name in rows_by_variant]
     return SuiteFile(
         suite=request.name,
         code_version=augment.__version__,
@@ -256,20 +254,18 @@ def describe_suite(store: Store, request: SuiteRequest) -> SuiteFile:
 
 
 def hash_files(store: Store, paths: Iterable[str]) -> dict[str, str]:
-    """Return the SHA-256 of files, by path.
-
-    Raises:
-        StoredFileMissing: There is no such file.
-    """
+    """Return the SHA-256 of files, by path; missing files have none."""
     ordered_paths = sorted(paths)
+
+    def digest_of(path: str) -> str | None:
+        try:
+            return hashlib.sha256(store.read(path)).hexdigest()
+        except StoredFileMissing:
+            return None
+
     with ThreadPoolExecutor(_NUM_READS, thread_name_prefix="hashes") as pool:
-        digests = pool.map(lambda path: hash_file(store, path), ordered_paths)
-        return dict(zip(ordered_paths, digests, strict=True))
-
-
-def hash_file(store: Store, path: str) -> str:
-    """Return the SHA-256 of a file."""
-    return hashlib.sha256(store.read(path)).hexdigest()
+        digests = zip(ordered_paths, pool.map(digest_of, ordered_paths), strict=True)
+        return {path: digest for path, digest in digests if digest is not None}
 
 
 def choose_probes(paths: Iterable[str]) -> tuple[str, ...]:
@@ -278,15 +274,6 @@ def choose_probes(paths: Iterable[str]) -> tuple[str, ...]:
     last = len(ordered_paths) - 1
     numbers = sorted({round(last * k / (NUM_PROBES - 1)) for k in range(NUM_PROBES)})
     return tuple(ordered_paths[number] for number in numbers) if ordered_paths else ()
-
-
-def _variant_of(suite: Suite, recipe_name: str) -> SuiteVariant | None:
-    """Return the suite's variant of a recipe's name; None for other recipes in the output."""
-    effect, _, level = recipe_name.rpartition("-")
-    if not (level.isascii() and level.isdecimal()):
-        return None
-    variant = SuiteVariant(effect, int(level))
-    return variant if variant in suite.variants else None
 
 
 def _variant_facts(request: SuiteRequest, name: str, rows: list[dict[str, Any]]) -> VariantFacts:

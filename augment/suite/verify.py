@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from augment.jobs.mirror import MIRROR_FOLDER
 from augment.output.names import STATE_FOLDER
-from augment.output.store import Store, StoredFileMissing
-from augment.suite.suite_file import SUITE_FILE, SuiteFile, hash_file, read_suite_file
+from augment.output.store import Store
+from augment.suite.suite_file import SUITE_FILE, SuiteFile, hash_files, read_suite_file
 
-# Files that are read at a time.
-_NUM_READS = 8
 # Folders that hold no file of a suite: the jobs' state, and copies of datasets.
 _OTHER_FOLDERS = (f"{STATE_FOLDER}/", f"{MIRROR_FOLDER}/")
 
@@ -42,26 +39,11 @@ def verify_suite(store: Store) -> Verification:
         OutputError: There is no `suite.json`, or it is damaged, or a file cannot be read.
     """
     suite_file = read_suite_file(store)
-    paths = sorted(suite_file.files)
-
-    def digest_of(path: str) -> str | None:
-        try:
-            return hash_file(store, path)
-        except StoredFileMissing:
-            return None
-
-    with ThreadPoolExecutor(_NUM_READS, thread_name_prefix="hashes") as pool:
-        digest_by_path = dict(zip(paths, pool.map(digest_of, paths), strict=True))
     stored_paths = [path for path in store.list("") if not path.startswith(_OTHER_FOLDERS)]
+    digests = hash_files(store, suite_file.files)
     return Verification(
         suite_file,
-        changed=tuple(
-            path
-            for path, digest in digest_by_path.items()
-            if digest is not None and digest != suite_file.files[path]
-        ),
-        missing=tuple(path for path, digest in digest_by_path.items() if digest is None),
-        unlisted=tuple(
-            path for path in stored_paths if path not in suite_file.files and path != SUITE_FILE
-        ),
+        changed=tuple(p for p, digest in digests.items() if digest != suite_file.files[p]),
+        missing=tuple(sorted(suite_file.files.keys() - digests.keys())),
+        unlisted=tuple(p for p in stored_paths if p not in suite_file.files and p != SUITE_FILE),
     )

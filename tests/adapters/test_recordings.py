@@ -41,6 +41,8 @@ def test_a_nuscenes_folder_stands_for_its_scenes(nuscenes: Path) -> None:
     assert expand_datasets([one]) == [one]
     street = JobScene(uri="procedural:street?seed=3")
     assert expand_datasets([street]) == [street]
+    nowhere = JobScene(uri="waymo:/nowhere")  # stays, so that opening it says what is missing
+    assert expand_datasets([nowhere]) == [nowhere]
 
 
 def test_nuscenes_descriptions_state_conditions_by_whole_words(nuscenes: Path) -> None:

@@ -26,6 +26,7 @@ from augment.output.manifest import (
 from augment.output.tables import FrameBoxes, boxes_bytes
 from augment.scene.labels import Boxes
 from augment.scores.probe import probe
+from augment.suite.suite_file import SceneFacts, SuiteFile, VariantFacts
 from recipes.moment import SceneTimes
 from recipes.schema import Output, Recipe, Smog, Weather
 
@@ -70,6 +71,7 @@ def write_suite(
     omitted: Mapping[str, Sequence[str]] | None = None,
     name: str = "weather-c-v1",
     unchanged: Sequence[str] = (),
+    levels_m: Sequence[float] = LEVELS_M,
 ) -> SuiteFolder:
     """Write a suite: manifest, images, label tables and `suite.json`.
 
@@ -77,6 +79,7 @@ def write_suite(
         omitted: Effects that do not count, by scene.
         name: Name of the suite.
         unchanged: Variants with the pictures of the clean render.
+        levels_m: The numbers that `suite.json` states of the levels.
     """
     variants = ("clean-0", *(f"fog-{k}" for k in range(1, 6)))
     rows: list[dict[str, Any]] = []
@@ -110,27 +113,41 @@ def write_suite(
             _write_tables(top, None if number == 0 else TRANSMITTANCES[number - 1])
     write_manifest(path, rows_to_table(rows))
     probes = {v: tuple(paths[k] for k in (0, 2, 5)) for v, paths in image_paths.items()}
-    entries = {
-        "format": 1,
-        "suite": name,
-        "variants": {
-            variant: {
-                "effect": variant.split("-")[0],
-                "level": number,
-                "number": "" if number == 0 else "meteorological optical range",
-                "unit": "" if number == 0 else "m",
-                "value": None if number == 0 else LEVELS_M[number - 1],
-                "probes": probes[variant],
-                "folder": f"{variant}-000",
-            }
+    suite_file = SuiteFile(
+        suite=name,
+        code_version="0.6.0",
+        backends=("cpu",),
+        changes={},
+        scale=1.0,
+        variants={
+            variant: VariantFacts(
+                effect=variant.split("-")[0],
+                level=number,
+                number="" if number == 0 else "meteorological optical range",
+                unit="" if number == 0 else "m",
+                value=None if number == 0 else levels_m[number - 1],
+                folder=f"{variant}-000",
+                numbers={},
+                recipe=recipe_of(variant).model_dump(mode="json", exclude={"seed"}),
+                seeds=dict.fromkeys(SCENES, 0),
+                probes=probes[variant],
+            )
             for number, variant in enumerate(variants)
         },
-        "scenes": {s: {"omitted_effects": list((omitted or {}).get(s, ()))} for s in SCENES},
-        "files": hashes,
-    }
-    text = json.dumps(entries, sort_keys=True, separators=(",", ":"))
-    entries["sha256"] = hashlib.sha256(text.encode()).hexdigest()
-    (path / "suite.json").write_text(json.dumps(entries, indent=1))
+        scenes={
+            scene: SceneFacts(
+                source=f"made:{scene}",
+                recorded_conditions=(),
+                omitted_effects=tuple((omitted or {}).get(scene, ())),
+                frames=FRAMES,
+                cameras=(CAMERA,),
+            )
+            for scene in SCENES
+        },
+        failed=(),
+        files=hashes,
+    )
+    (path / "suite.json").write_bytes(suite_file.to_json())
     return SuiteFolder(path, variants, {v: tuple(p) for v, p in image_paths.items()}, probes)
 
 

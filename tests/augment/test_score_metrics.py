@@ -18,7 +18,15 @@ from augment.scores.box_overlaps_3d import (
     polygon_area,
 )
 from augment.scores.coco_metric import coco_average_precision
-from augment.scores.half_recall import HARSHER, MILDER, find_half_recall, half_places, value_at
+from augment.scores.half_recall import (
+    HARSHER,
+    MILDER,
+    Levels,
+    find_half_recall,
+    half_places,
+    place_text,
+    value_at,
+)
 from augment.scores.kitti_metric import DIFFICULTIES, kitti_average_precision, precision_at_recalls
 from augment.scores.matching import assign_detections, box_overlaps
 from augment.scores.predictions import ImageDetections
@@ -27,6 +35,7 @@ from augment.scores.robustness import EffectValues, summarize
 from augment.scores.scene_bootstrap import recall_interval
 from augment.scores.semantic_metric import class_overlaps, count_pixels
 from augment.scores.truth import ImageTruth
+from recipes.suite import load_suite
 
 
 def make_truth(boxes, categories=None, ignored=(), boxes_3d=None, truncated=0.0) -> ImageTruth:
@@ -375,17 +384,38 @@ def test_half_recall_is_interpolated_over_the_logarithm():
     assert half_places(np.array([0.8]), np.array([[0.4, 0.3]])).tolist() == [0.0]
 
 
+def test_half_recall_between_levels_of_one_number_is_stated_in_words():
+    """Levels 4 and 5 of `wet` have the same film: that of level 5 has puddles."""
+    wet = load_suite("weather-c-v1").effects["wet"]
+    values = tuple(level.value for level in wet.levels)
+    levels = Levels(tuple(f"wet-{k}" for k in range(1, 6)), values, wet.unit)
+    texts = {
+        2.5: "0.346 mm",
+        3.0: "0.6 mm",
+        3.4: "wet-5 but not wet-4, both 0.6 mm",
+        4.0: "wet-5 but not wet-4, both 0.6 mm",
+        MILDER: "milder than 0.02 mm",
+        HARSHER: "harsher than wet-5, 0.6 mm",
+    }
+    assert {place: place_text(place, levels) for place in texts} == texts
+    assert [value_at(place, values) for place in (3.4, 4.0, HARSHER)] == [None] * 3
+    # Recall halves in the puddles of level 5 alone.
+    hits = np.array([[10.0, 10.0, 9.0, 8.0, 3.0]] * 2)
+    full = np.full(2, 10.0)
+    half = find_half_recall(hits, full, full, levels, np.random.default_rng(5))
+    assert half is not None and half.value is None
+    assert {half.text, *(half.interval or ())} == {"wet-5 but not wet-4, both 0.6 mm"}
+
+
 def test_interval_of_half_recall_covers_the_scenes_and_is_reproducible():
     # Scene after scene: recall halves between levels 2 and 3, or between 4 and 5.
     early = [9.0, 9.0, 1.0, 0.0, 0.0]
     late = [10.0, 10.0, 9.0, 9.0, 1.0]
     hits = np.array([early, late] * 6)
-    values = (1.0, 4.0, 16.0, 50.0, 100.0)
+    levels = Levels(tuple("abcde"), (1.0, 4.0, 16.0, 50.0, 100.0), "mm/h")
     clean_hits = np.full(12, 10.0)
     results = [
-        find_half_recall(
-            hits, clean_hits, np.full(12, 10.0), values, "mm/h", np.random.default_rng(5)
-        )
+        find_half_recall(hits, clean_hits, np.full(12, 10.0), levels, np.random.default_rng(5))
         for _ in range(2)
     ]
     assert results[0] == results[1]
@@ -394,11 +424,11 @@ def test_interval_of_half_recall_covers_the_scenes_and_is_reproducible():
     low, high = (float(text.split()[0]) for text in half.interval)
     assert 4.0 < low < half.value < high < 100.0
     alone = find_half_recall(
-        hits[:1], clean_hits[:1], np.full(1, 10.0), values, "mm/h", np.random.default_rng(5)
+        hits[:1], clean_hits[:1], np.full(1, 10.0), levels, np.random.default_rng(5)
     )
     assert alone is not None and alone.interval is None
     nothing = np.zeros(12)
-    assert find_half_recall(hits, nothing, clean_hits, values, "", np.random.default_rng(5)) is None
+    assert find_half_recall(hits, nothing, clean_hits, levels, np.random.default_rng(5)) is None
 
 
 def test_interval_of_recall_is_that_of_scenes_and_not_of_boxes():
@@ -409,6 +439,7 @@ def test_interval_of_recall_is_that_of_scenes_and_not_of_boxes():
     assert low == pytest.approx(0.345, abs=0.02)
     assert high == pytest.approx(0.655, abs=0.02)
     assert recall_interval(hits[:1], hits[:1], np.random.default_rng(2)) is None
+    assert recall_interval(np.zeros(2), np.zeros(2), np.random.default_rng(2)) is None
 
 
 def test_bootstrap_interval_covers_the_truth_as_often_as_it_says():
@@ -422,7 +453,7 @@ def test_bootstrap_interval_covers_the_truth_as_often_as_it_says():
     for _ in range(40):
         hits = truth_hits[rng.integers(0, 2, 30)]
         full = np.full(30, 10.0)
-        half = find_half_recall(hits, full, full, values, "m", rng)
+        half = find_half_recall(hits, full, full, Levels(tuple("abcd"), values, "m"), rng)
         assert half is not None and half.interval is not None
         low, high = (float(text.split()[0]) for text in half.interval)
         covered += low * 0.995 <= true_value <= high * 1.005  # texts have three digits

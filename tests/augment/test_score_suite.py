@@ -75,6 +75,16 @@ def test_recall_of_every_level_is_that_of_the_objects_that_were_written(suite, g
     assert not scores.warnings
 
 
+def test_half_recall_of_levels_with_one_number_names_the_levels(tmp_path):
+    suite = write_suite(tmp_path / "out", levels_m=(600.0, 300.0, 150.0, 75.0, 75.0))
+    top = write_coco(
+        tmp_path / "p", suite, lambda number, level: [0, 1, 2][: 3 if level < 4 else 6 - level]
+    )
+    half = score_suite(open_store(suite.path), top).effects["fog"].half_recall
+    assert half is not None
+    assert (half.text, half.value) == ("fog-5 but not fog-4, both 75 m", None)
+
+
 def test_objects_are_binned_by_the_transmittance_of_their_own_variant(suite, good_predictions):
     bins = score_suite(open_store(suite.path), good_predictions).recall_bins["fog"]
     counts = [(counted.objects, counted.num_found) for counted in bins.transmittance]
@@ -198,6 +208,13 @@ def test_semantic_scores_worked_by_hand(suite, tmp_path):
     path = top / "fog-3" / "semantic" / "000002.png"
     cv2.imwrite(str(path), np.full((10, 10), 1, np.uint8))
     with pytest.raises(ScoreError, match=r"fog-3: image 000002: expected 96 x 64 pixels; got 10"):
+        score_suite(open_store(suite.path), top)
+    # A header alone states 25 gigabytes: it must not be decoded.
+    path.write_bytes(cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1].tobytes())
+    huge = bytearray(path.read_bytes())
+    huge[16:24] = (160_000).to_bytes(4, "big") * 2
+    path.write_bytes(huge)
+    with pytest.raises(ScoreError, match=r"expected 96 x 64 pixels; got 160000 x 160000"):
         score_suite(open_store(suite.path), top)
     path.write_bytes(b"no png")
     with pytest.raises(ScoreError, match=r"000002.png is no 8-bit PNG"):
@@ -331,9 +348,11 @@ def test_coco_results_that_do_not_fit_are_refused_with_names_and_counts(suite, p
         (changed(bbox=[0, 0, 0, 5]), r"without area: 2"),
         (changed(score=float("inf")), r"not finite, or without area: 2"),
         (changed(bbox=[0, 0, 5]), r"entry 0 is no detection of COCO"),
+        (changed(score=10**400), r"entry 0 is no detection of COCO"),
         ("[1, 2]", r"entry 0 is no detection of COCO"),
         ('{"a": 1}', r"neither COCO's results .* nor nuScenes'"),
         ("{", r"cannot be read as JSON"),
+        ("\n[", r"cannot be read as JSON"),
     )
     for text, message in cases:
         path.write_text(text)
@@ -435,6 +454,10 @@ def test_a_baseline_is_read_from_predictions_and_from_json(suite, good_predictio
         with pytest.raises(ScoreError, match=message):
             score_suite(store, good_predictions, path)
         path.write_text(json.dumps(base.model_dump(mode="json")))
+    edit_json(path, lambda content: content["effects"]["fog"]["levels"][4].update(level=7))
+    with pytest.raises(ScoreError, match=r"of another levels"):
+        score_suite(store, good_predictions, path)
+    path.write_text(json.dumps(base.model_dump(mode="json")))
     edit_json(path, lambda content: {**content, "suite_sha256": "0" * 64})
     assert "other files of weather-c-v1" in score_suite(store, good_predictions, path).warnings[-1]
 

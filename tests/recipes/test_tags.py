@@ -203,6 +203,24 @@ def test_ranges_in_rain_and_snowfall_are_those_that_pictures_show() -> None:
         assert law_per_m == pytest.approx(sizes_of("snow", rate).extinction_per_m, rel=0.2)
 
 
+def test_lamps_of_vehicles_are_tagged_where_auto_turns_them_on() -> None:
+    cases = (
+        (Light(), Weather(), False),
+        (Light(), Weather(rain=Rain(rate_mm_h=1)), True),
+        (Light(), Weather(snowfall=Snowfall(rate_mm_h=1)), True),
+        (Light(), Weather(smog=Smog(mor_m=400)), True),
+        (Light(), Weather(smog=Smog(mor_m=600)), False),
+        (Light(sky_luminance_cd_m2=100), Weather(), True),
+        (Light(sky_luminance_cd_m2=1000), Weather(), False),
+        (Light(vehicles="off", time="night"), Weather(rain=Rain(rate_mm_h=1)), False),
+        (Light(vehicles="on"), Weather(), True),
+        (None, Weather(rain=Rain(rate_mm_h=1)), False),
+    )
+    for light, weather, has_lamps in cases:
+        names = {tag.name for tag in tags_of(Recipe(light=light, weather=weather)).openlabel}
+        assert ("ArtificialVehicleLighting" in names) == has_lamps, (light, weather)
+
+
 def test_weather_of_several_kinds_has_the_tags_of_each() -> None:
     weather = Weather(
         smog=Smog(mor_m=300),

@@ -9,14 +9,8 @@ from augment.effects.lamps.hour import Hour
 from augment.effects.lamps.signs import has_signs
 from augment.scene.scene import Scene
 from recipes.fields import section_at
-from recipes.light import Light
+from recipes.light import DIM_LUX, Light, foul_weather
 from recipes.schema import Recipe
-from recipes.smog import MOR_DEPTH
-
-# Distance over which less than 5 % of the light must arrive for `auto` to turn lamps on, metres.
-POOR_VISIBILITY_M = 500.0
-# Illuminance of level ground below which `auto` turns lamps on, lux.
-DIM_LUX = 1000.0
 
 # Names of the passes.
 NIGHT_SKY = "sky of the hour"
@@ -165,14 +159,11 @@ def auto_reason(recipe: Recipe, hour: Hour) -> tuple[bool, str]:
 
 def _foul_weather(recipe: Recipe) -> str:
     """Return the weather that makes drivers turn on their lamps, in words; empty for none."""
-    if (section_at(recipe, "weather.rain.rate_mm_h") or 0.0) > 0:
-        return "it rains"
-    if (section_at(recipe, "weather.snowfall.rate_mm_h") or 0.0) > 0:
-        return "it snows"
-    extinction_per_m = section_at(recipe, "weather.smog.resolved_extinction_per_m") or 0.0
-    if extinction_per_m * POOR_VISIBILITY_M > MOR_DEPTH:
-        return f"less than 5 % of the light arrives over {POOR_VISIBILITY_M:g} m of fog"
-    return ""
+    return foul_weather(
+        section_at(recipe, "weather.rain.rate_mm_h") or 0.0,
+        section_at(recipe, "weather.snowfall.rate_mm_h") or 0.0,
+        section_at(recipe, "weather.smog.resolved_extinction_per_m") or 0.0,
+    )
 
 
 def steps_of(plan: LightPlan, lamp_reason: str, exposure_reason: str) -> tuple[Step, ...]:
