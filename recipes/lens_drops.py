@@ -15,7 +15,6 @@ MAX_COUNT = 500
 # Largest share of a picture that drops cover: the count grows without bound towards 1.
 MAX_SHARE = 0.6
 # In words of JSON Schema: count and share are not both present and not null.
-# The same in words of JSON Schema.
 _ONE_NUMBER: JsonDict = {
     "not": {
         "required": ["count", "share"],
