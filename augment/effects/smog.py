@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
@@ -38,7 +38,8 @@ from augment.output.box_tables import BoxTable
 from augment.render.buffers import EXPECTED_DEPTH, MEDIAN_DEPTH
 from augment.render.fog import MAX_EXPONENT, Fog, optical_depth_numpy
 from augment.render.fog_banks import FogBanks, bank_seed
-from augment.render.fog_table import densities_at, point_means_numpy, ray_means, visible_distances
+from augment.render.fog_image import point_optical_depth_numpy
+from augment.render.fog_table import densities_at, ray_means, visible_distances
 from augment.render.linear_airlight import mix_linear_light
 from augment.render.scatter import scatter_forward, scattered_share
 from augment.scene.boxes import NOT_COUNTED, WorldBoxes, pixels_of_boxes
@@ -206,7 +207,8 @@ class SmogEffect(Effect):
         rgb = view.rgb
         fog_share = view.raster.fog_share
         if settings.is_linear:
-            fog = view.layers.fog or settings.fog  # with the airlight in the camera's exposure
+            # That of the layers has the airlight in the camera's exposure.
+            fog = view.layers.fog or settings.fog_at(effect.weather_time_s)
             with timed(LINEAR_LIGHT):
                 share = fog_share
                 if share is None:
@@ -374,38 +376,54 @@ def box_transmittance(
         water_level_z_m: height of the water, scene world. An eye under water sees other things
             under water through no smog, as `flood_view` draws them.
     """
-    pixels = np.full(len(boxes), NOT_COUNTED)
-    transmittance = np.ones(len(boxes))
     if fog is None:
-        return BoxTransmittance(np.where(boxes.is_usable, transmittance, np.nan), pixels)
-    eye_m = camera.centre.numpy()
+        transmittance = np.where(boxes.is_usable, 1.0, np.nan)
+        return BoxTransmittance(transmittance, np.full(len(boxes), NOT_COUNTED))
+
+    def optical_depth_to(points_m: np.ndarray) -> np.ndarray:
+        """Return the optical depth between the eye and points."""
+        return point_optical_depth_numpy(fog, camera, points_m)
+
+    return mean_transmittance(boxes, camera, optical_depth_to, surface_depth_m, water_level_z_m)
+
+
+def mean_transmittance(
+    boxes: WorldBoxes,
+    camera: Camera,
+    optical_depth_to: Callable[[np.ndarray], np.ndarray],
+    surface_depth_m: Float32[np.ndarray, "H W"] | None,
+    water_level_z_m: float | None = None,
+) -> BoxTransmittance:
+    """Return the mean of exp(-tau) between the camera's eye and what shows each box.
+
+    Args:
+        boxes: as in `box_transmittance`, like all arguments that are not named here.
+        camera: the same.
+        optical_depth_to: function that gives tau between the eye and points [..., 3], scene world.
+        surface_depth_m: the same.
+        water_level_z_m: the same.
+    """
+    pixels = np.full(len(boxes), NOT_COUNTED)
+    world_from_camera = camera.world_from_camera.numpy()
+    eye_m = world_from_camera[:3, 3]
     is_dry = water_level_z_m is None or eye_m[2] > water_level_z_m
 
-    def transmittance_to(
-        distance_m: np.ndarray, point_z_m: np.ndarray, bank_means: np.ndarray | float
-    ) -> np.ndarray:
-        t = np.exp(-bank_means * optical_depth_numpy(fog, distance_m, eye_m[2], point_z_m))
-        return t if is_dry else np.where(point_z_m <= water_level_z_m, 1.0, t)
+    def transmittance_to(points_m: np.ndarray) -> np.ndarray:
+        """Return the transmittance between the eye and points."""
+        t = np.exp(-optical_depth_to(points_m))
+        return t if is_dry else np.where(points_m[..., 2] <= water_level_z_m, 1.0, t)
 
     points = np.concatenate([boxes.corners_m, boxes.centres_m[:, None]], axis=1)  # [B, 9, 3]
-    distance = np.linalg.norm(points - eye_m, axis=-1)
-    means = 1.0 if fog.banks is None else point_means_numpy(fog, camera, points)
-    transmittance = transmittance_to(distance, points[..., 2], means).mean(axis=1)
+    transmittance = transmittance_to(points).mean(axis=1)
     if surface_depth_m is not None:
         pixels[:] = 0
-        rotation = camera.world_from_camera[:3, :3].numpy()
-        upwards = rotation[2]  # the world's z along the camera's axes
         for number, rows, columns in pixels_of_boxes(boxes, camera, surface_depth_m):
             z = surface_depth_m[rows, columns].astype(np.float64)
             across = (columns + 0.5 - camera.cx) / camera.fx
             down = (rows + 0.5 - camera.cy) / camera.fy
-            point_z = eye_m[2] + z * (across * upwards[0] + down * upwards[1] + upwards[2])
-            distance = z * np.sqrt(1 + across**2 + down**2)
+            offsets = np.stack([z * across, z * down, z], -1) @ world_from_camera[:3, :3].T
             pixels[number] = len(rows)
-            if fog.banks is not None:
-                offsets = np.stack([z * across, z * down, z], -1) @ rotation.T
-                means = point_means_numpy(fog, camera, offsets + eye_m)
-            transmittance[number] = float(transmittance_to(distance, point_z, means).mean())
+            transmittance[number] = float(transmittance_to(eye_m + offsets).mean())
     return BoxTransmittance(np.where(boxes.is_usable, transmittance, np.nan), pixels)
 
 

@@ -270,7 +270,7 @@ def look_up(table: BankTable, offsets: Float[Tensor, "*B 3"]) -> Float[Tensor, "
     """Return the table's means at offsets in the world: the definition of `look_up_image`."""
     head = table.numbers[:HEAD].tolist()
     num_climbs, num_headings, num_nodes = table.shape
-    logs = torch.from_numpy(table.numbers[HEAD:]).to(offsets.device, offsets.dtype)
+    logs = torch.from_numpy(table.numbers[HEAD:]).to(offsets.device)
     east, north, up = offsets.unbind(-1)
     level = (east * east + north * north).sqrt()
     turn = north / (east.abs() + north.abs()).clamp_min(1e-30)
@@ -284,11 +284,14 @@ def look_up(table: BankTable, offsets: Float[Tensor, "*B 3"]) -> Float[Tensor, "
     along = along - node
     first = heading * num_nodes + node
 
+    def node_value(start: Tensor) -> Tensor:
+        """Return the value between two nodes of a heading."""
+        pair = (logs[number].to(offsets.dtype) for number in (start, start + 1))
+        return torch.lerp(*pair, along)
+
     def layer_value(start: Tensor) -> Tensor:
         """Return the value between four neighbours at one climb."""
-        near = torch.lerp(logs[start], logs[start + 1], along)
-        start = start + num_nodes
-        return torch.lerp(near, torch.lerp(logs[start], logs[start + 1], along), turn)
+        return torch.lerp(node_value(start), node_value(start + num_nodes), turn)
 
     if num_climbs == 1:
         return torch.exp2(layer_value(first))

@@ -12,6 +12,7 @@ from augment import effects
 from augment.effects.effect import EffectPlan, LabelInputs
 from augment.effects.falling.air import Precipitation, cell_walk, draw_falling, find_drops, glow_of
 from augment.effects.falling.drops import sizes_of
+from augment.effects.falling.effect import wind_velocity_mps
 from augment.effects.falling.lidar import precipitation_echoes, scatterers_of
 from augment.effects.falling.shower import (
     LIGHT_UNDER_CLOUD,
@@ -19,7 +20,6 @@ from augment.effects.falling.shower import (
     extinctions_of,
     reference_place,
     shower_about,
-    unit_direction,
 )
 from augment.effects.falling.shutter import STANDING
 from augment.effects.lidar.beam import DEFAULT_MODEL, Echoes
@@ -295,14 +295,17 @@ def test_beams_and_boxes_lose_what_the_pictures_rays_lose():
     inputs = LabelInputs(EffectPlan(falling, ()), None, None, None)
     columns = effect.measure_boxes(boxes, camera, inputs)
     np.testing.assert_allclose(columns["rain_transmittance"], expected, rtol=1e-3)
+    # From under water, no rain lies before what is under water.
+    flooded = dataclasses.replace(inputs, water_level_z_m=2.0)
+    assert effect.measure_boxes(boxes, camera, flooded)["rain_transmittance"] == 1
 
 
 def test_the_plan_tells_the_shower_and_a_dry_place_has_its_curtain():
     camera = view(position=(4.0, 5.0, 1.5))
     scene = scene_of(camera)
     assert reference_place(scene) == (4.0, 5.0)
-    assert unit_direction(0.0) == pytest.approx((-1.0, 0.0))
-    assert unit_direction(90.0) == pytest.approx((0.0, -1.0))
+    assert wind_velocity_mps(1.0, 0.0) == pytest.approx((-1.0, 0.0))
+    assert wind_velocity_mps(1.0, 90.0) == pytest.approx((0.0, -1.0))
     places = (RateAtPlace(distance_m=-900, rate_mm_h=30), RateAtPlace(distance_m=-300, rate_mm_h=0))
     for weather in (
         Weather(rain=Rain(rate_mm_h=0.0, along=places)),

@@ -602,12 +602,79 @@ def classes_in_row(nearest, bands, partial):
 
 
 @kernel_function()
+def veil_depth(z, count, slope, offset, partial):
+    """Return the veil's optical depth at unit depth up to eight surfaces at z.
+
+    count, slope, offset, partial: as classes_in_row gives them.
+    """
+    zeros = v8.broadcast(np.float32(0))
+    tau = v8.broadcast(slope) * z + v8.broadcast(offset)
+    for b in range(Index(count)):
+        inside = v8.maximum(z - v8.broadcast(partial[b, 1]), zeros)
+        inside = v8.minimum(inside, v8.broadcast(partial[b, 2]))
+        beyond = v8.maximum(z - v8.broadcast(partial[b, 4]), zeros)
+        tau = tau + v8.broadcast(partial[b, 0]) * (
+            inside * inside * v8.broadcast(partial[b, 3]) + beyond
+        )
+    return tau
+
+
+@kernel_function()
 def decay(x):
     """Return exp(-x) for x >= 0; larger x than MAX_EXPONENT count as MAX_EXPONENT."""
     x = v8.minimum(
         v8.maximum(x, v8.broadcast(np.float32(0))), v8.broadcast(np.float32(MAX_EXPONENT))
     )
     return exp2_fine(x * v8.broadcast(-LOG2_E))
+
+
+@kernel_function()
+def light_of_row(row, rays, airlight, glow, light):
+    """Write the light of veil and drops in an image row.
+
+    Args:
+        row: the row.
+        rays: as in blend_falling.
+        airlight: as in blend_falling.
+        glow: as in blend_falling.
+        light: output [3, >= 4]: airlight; mean light of a drop; its change to the right; its change
+            ahead.
+    """
+    v = (np.float32(row) + np.float32(0.5) - rays[3]) * rays[1]
+    for c in range(3):
+        light[c, 0] = airlight[c]
+        light[c, 1] = glow[c, 3]
+        light[c, 2] = glow[c, 0]
+        light[c, 3] = glow[c, 1] * v + glow[c, 2]
+
+
+@kernel_function()
+def surface_parts(splats, pixel, opacity, red, green, blue):
+    """Return the surfaces' part of eight colours, and where it is apart from the sky's.
+
+    Args:
+        splats: as in blend_falling.
+        pixel: number of the first pixel.
+        opacity: alpha of the pixels.
+        red: red of the picture.
+        green: green of the picture.
+        blue: blue of the picture.
+
+    Returns:
+        Red, green and blue; the lanes whose pixels show both surfaces and sky; True if any does.
+    """
+    zeros = v8.broadcast(np.float32(0))
+    ones = v8.broadcast(np.float32(1))
+    r = red
+    g = green
+    b = blue
+    edge = v8.minimum(opacity, ones - opacity) - v8.broadcast(np.float32(EDGE))
+    is_mixed = False
+    if splats.size > 0 and v8.has_nonnegative_lane(edge):
+        r, g, b = v8.load_colours(splats, Index(3) * pixel)
+        edge = v8.minimum(edge, green - g - v8.broadcast(np.float32(EDGE)))
+        is_mixed = v8.has_nonnegative_lane(edge)
+    return (r, g, b), v8.at_least(edge, zeros), is_mixed
 
 
 @kernel_function()
@@ -623,16 +690,7 @@ def _blend_pixels(pixels, at, splats, pixel, u, lengths, opacity, clear, tau, sk
     surface_transmittance = decay(tau * lengths)
     per_length = ones / lengths
     red, green, blue = v8.load_colours(pixels, at)
-    r = red
-    g = green
-    b = blue
-    edge = v8.minimum(opacity, ones - opacity) - v8.broadcast(np.float32(EDGE))
-    is_mixed = False
-    if splats.size > 0 and v8.has_nonnegative_lane(edge):
-        r, g, b = v8.load_colours(splats, Index(3) * pixel)
-        edge = v8.minimum(edge, green - g - v8.broadcast(np.float32(EDGE)))
-        is_mixed = v8.has_nonnegative_lane(edge)
-    edge = v8.at_least(edge, zeros)
+    (r, g, b), edge, is_mixed = surface_parts(splats, pixel, opacity, red, green, blue)
     red = _veil(
         v8.maximum(red, zeros), r, is_mixed, edge, light[0], opacity, surface_transmittance, sky
     )
@@ -719,14 +777,7 @@ def _blend_row(
         u = u * v8.broadcast(rays[0])
         lengths = v8.sqrt(flat + u * u)
         z = v8.load(depth, pixel)
-        tau = v8.broadcast(slope) * z + v8.broadcast(offset)
-        for b in range(Index(count)):
-            inside = v8.maximum(z - v8.broadcast(partial[b, 1]), zeros)
-            inside = v8.minimum(inside, v8.broadcast(partial[b, 2]))
-            beyond = v8.maximum(z - v8.broadcast(partial[b, 4]), zeros)
-            tau = tau + v8.broadcast(partial[b, 0]) * (
-                inside * inside * v8.broadcast(partial[b, 3]) + beyond
-            )
+        tau = veil_depth(z, count, slope, offset, partial)
         sky = zeros
         if shows_sky:  # below the horizon nothing is visible through so much veil
             steep = v8.broadcast(climb[0]) * u + v8.broadcast(level)
@@ -819,10 +870,7 @@ def blend_falling(
             first = Index((row - top) * width)
             for j in range(Index(width)):
                 mask[Index(row), j] = clear[first + j] < min_clear_share
-            v = (np.float32(row) + np.float32(0.5) - rays[3]) * rays[1]
-            for c in range(3):
-                light[c, 0], light[c, 1], light[c, 2] = airlight[c], glow[c, 3], glow[c, 0]
-                light[c, 3] = glow[c, 1] * v + glow[c, 2]
+            light_of_row(row, rays, airlight, glow, light)
             _blend_row(
                 row,
                 width,

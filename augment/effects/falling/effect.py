@@ -27,7 +27,7 @@ from augment.effects.falling.drop_covers import cover_of_drops
 from augment.effects.falling.drops import Kind
 from augment.effects.falling.labels import falling_table, measure_falling
 from augment.effects.falling.lidar import precipitation_echoes, scatterers_of
-from augment.effects.falling.shower import Shower, reference_place, unit_direction
+from augment.effects.falling.shower import Shower, reference_place
 from augment.effects.falling.shutter import frame_interval_s, motion_of
 from augment.effects.lidar.beam import Echoes
 from augment.errors import SceneError
@@ -176,7 +176,7 @@ def _shower_of(section: Rain | Snowfall, scene: Scene, seed: int) -> Shower | No
     places = tuple((place.distance_m, place.rate_mm_h) for place in section.along or ())
     if all(rate == section.rate_mm_h for _, rate in places):
         return None
-    direction = unit_direction(section.wind_from_deg)
+    direction = wind_velocity_mps(1.0, section.wind_from_deg)
     return Shower(places, direction, reference_place(scene), seed)
 
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float32, Float64
 
 from augment.effects.effect import LabelInputs
-from augment.effects.falling.shower import ShowerTable
-from augment.effects.smog import box_transmittance
+from augment.effects.smog import box_transmittance, mean_transmittance
 from augment.output.box_tables import BoxTable, pixel_fraction
 from augment.render.fog import Fog
-from augment.scene.boxes import NOT_COUNTED, WorldBoxes, count_pixels, pixels_of_boxes
+from augment.scene.boxes import NOT_COUNTED, WorldBoxes, count_pixels
 from augment.scene.cameras import Camera
 
 
@@ -51,15 +49,18 @@ def measure_falling(
     """
     transmittance_column, _, marked_column = table.stored_columns
     data = inputs.plan.data
-    if data is not None and data.shower is not None:
-        shower = data.shower_about(camera.centre.numpy())
-        transmittance = shower_transmittance(boxes, camera, shower, inputs.depth_m)
+    surfaces = (inputs.depth_m, inputs.water_level_z_m)
+    shower = None if data is None else data.shower_about(camera.centre.numpy())
+    if shower is not None:
+        eye_m = camera.centre.numpy()
+        estimate = mean_transmittance(
+            boxes, camera, lambda points_m: shower.optical_depth(points_m - eye_m), *surfaces
+        )
     else:
         fog = None if data is None else Fog(data.sizes.extinction_per_m, (0.0, 0.0, 0.0))
-        estimate = box_transmittance(boxes, camera, fog, inputs.depth_m, inputs.water_level_z_m)
-        transmittance = estimate.transmittance
+        estimate = box_transmittance(boxes, camera, fog, *surfaces)
     columns = {
-        transmittance_column: transmittance,
+        transmittance_column: estimate.transmittance,
         "pixels": np.full(len(boxes), NOT_COUNTED),
         marked_column: np.zeros(len(boxes), np.int64),
     }
@@ -67,35 +68,3 @@ def measure_falling(
         box_pixels = count_pixels(boxes, camera, inputs.depth_m, inputs.mask)
         columns |= {"pixels": box_pixels.num_pixels, marked_column: box_pixels.num_marked}
     return columns
-
-
-def shower_transmittance(
-    boxes: WorldBoxes,
-    camera: Camera,
-    shower: ShowerTable,
-    surface_depth_m: Float32[np.ndarray, "H W"] | None,
-) -> Float64[np.ndarray, " B"]:
-    """Return the transmittance of a shower between the camera's eye and each box.
-
-    Args:
-        boxes: the boxes, in the scene's world.
-        camera: camera of the image.
-        shower: the shower about the camera.
-        surface_depth_m: z of the surfaces that the pixels show, metres, 0 = none. The result is the
-            mean over a box's pixels, or, without any, over its corners and its centre.
-    """
-    eye_m = camera.centre.numpy()
-    points = np.concatenate([boxes.corners_m, boxes.centres_m[:, None]], axis=1)  # [B, 9, 3]
-    points = np.where(boxes.is_usable[:, None, None], points, eye_m)
-    transmittance = np.exp(-shower.optical_depth(points - eye_m)).mean(axis=1)
-    if surface_depth_m is not None:
-        world_from_camera = camera.world_from_camera[:3, :3].numpy()
-        for number, rows, columns in pixels_of_boxes(boxes, camera, surface_depth_m):
-            z = surface_depth_m[rows, columns].astype(np.float64)
-            if not len(z):
-                continue
-            across = (columns + 0.5 - camera.cx) / camera.fx
-            down = (rows + 0.5 - camera.cy) / camera.fy
-            rays = np.stack([z * across, z * down, z], 1) @ world_from_camera.T
-            transmittance[number] = float(np.exp(-shower.optical_depth(rays)).mean())
-    return np.where(boxes.is_usable, transmittance, np.nan)

@@ -18,7 +18,6 @@ How dark a cloud and the air below it are is assumed: the constants say so.
 from __future__ import annotations
 
 import functools
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -30,7 +29,7 @@ from augment.effects.falling.shower_kernels import LUMP_STEP_M, MIN_ALONG_M, STE
 from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
 from recipes.rain import OVERCAST_MM_H
-from recipes.shower import CLOUD_EDGE_M
+from recipes.shower import CLOUD_EDGE_M, MAX_PLACE_RATE_MM_H
 
 # Number of rows, half of them before the eye and half behind.
 NUM_ROWS = 8001
@@ -48,7 +47,7 @@ NUM_LUMPS = 256
 CLOUD_HUE = 0.5
 # Smallest rate of the table of extinctions, mm/h; below it, the extinction is in proportion.
 _MIN_RATE_MM_H = 1e-3
-_MAX_RATE_MM_H = 300.0
+# Number of rates of that table.
 _NUM_RATES = 96
 
 
@@ -112,7 +111,7 @@ def reference_place(scene: Scene) -> tuple[float, float]:
 @functools.cache
 def _extinction_table(kind: Kind) -> tuple[np.ndarray, np.ndarray]:
     """Return logarithms of rates and of their extinctions in 1/m."""
-    rates = np.geomspace(_MIN_RATE_MM_H, _MAX_RATE_MM_H, _NUM_RATES)
+    rates = np.geomspace(_MIN_RATE_MM_H, MAX_PLACE_RATE_MM_H, _NUM_RATES)
     extinctions = [sizes_of.__wrapped__(kind, float(rate)).extinction_per_m for rate in rates]
     return np.log(rates), np.log(extinctions)
 
@@ -229,7 +228,7 @@ def shower_in_view(table: ShowerTable, camera: Camera, airlight: np.ndarray) -> 
 def lumps_of_cloud(seed: int) -> np.ndarray:
     """Return the lumps of a cloud's base, float32 [NUM_LUMPS, NUM_LUMPS], -1 to 1, periodic.
 
-    Their spectrum falls from _LUMP_M on as that of turbulence in a plane, k^(-8/3).
+    Their spectrum falls from LUMP_M on as that of turbulence in a plane, k^(-8/3).
     """
     rng = np.random.default_rng([seed, 0x5EED])
     frequency = np.hypot(np.fft.fftfreq(NUM_LUMPS)[:, None], np.fft.rfftfreq(NUM_LUMPS))
@@ -240,9 +239,3 @@ def lumps_of_cloud(seed: int) -> np.ndarray:
     noise = np.fft.rfft2(rng.standard_normal((NUM_LUMPS, NUM_LUMPS)))
     lumps = np.fft.irfft2(noise * amplitude, (NUM_LUMPS, NUM_LUMPS))
     return np.clip(lumps / (2 * lumps.std()), -1, 1).astype(np.float32)
-
-
-def unit_direction(from_deg: float) -> tuple[float, float]:
-    """Return the unit vector in which what comes from `from_deg` moves."""
-    angle = math.radians(from_deg)
-    return -math.cos(angle), -math.sin(angle)

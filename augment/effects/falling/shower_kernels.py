@@ -16,7 +16,10 @@ from augment.effects.falling.drop_kernels import (
     classes_in_row,
     cover_band,
     decay,
+    light_of_row,
     nearest_in_row,
+    surface_parts,
+    veil_depth,
 )
 from augment.effects.falling.drops import NUM_CLASSES
 from augment.render.cpu import simd as v8
@@ -41,6 +44,8 @@ LUMP_DEPTH = 0.7
 LUMP_CLIMB = 0.12
 # Distance along the way below which a ray has the rate of its eye, metres.
 MIN_ALONG_M = 0.5
+# Numbers of a ray to the sky, see _integrate_sky.
+NUM_SKY_NUMBERS = 4
 
 _MIN_CLIMB = np.float32(1e-6)  # smallest climb of a ray to the sky over its way ahead
 _MIN_ALONG = np.float32(MIN_ALONG_M)
@@ -49,7 +54,6 @@ _LAYER = np.float32(LAYER_M)
 _TOP = np.float32(CLOUD_TOP_M)
 _CLOUD_DEPTH = np.float32(CLOUD_EXTINCTION_PER_M * (CLOUD_TOP_M - LAYER_M))  # straight up
 _MIN_INTEGRAL = np.float32(1e-9)  # smallest G that the light of the veil is divided by
-NUM_SKY_NUMBERS = 4
 _LAYER_CELLS = np.float32(LAYER_M / LUMP_STEP_M)  # height of the cloud's base in cells of lumps
 _PER_LUMP_CLIMB = np.float32(1 / LUMP_CLIMB)
 _LUMP_DEPTH = np.float32(LUMP_DEPTH)
@@ -225,24 +229,15 @@ def _veil(color, splats, is_mixed, edge, light, opacity, surface, sky):
 
 @kernel_function()
 def _blend_pixels(pixels, at, splats, pixel, u, lengths, opacity, clear, surface, sky, light):
-    """Blend eight pixels with the veil and the drops, in place. light [3, 5]: as in blend_shower.
+    """Blend eight pixels with the veil and the drops, in place.
 
-    surface, sky: as in _veil.
+    surface, sky: as in _veil. light [3, 5]: as light_of_row writes it, and light of a cloud.
     """
     ones = v8.broadcast(np.float32(1))
     zeros = v8.broadcast(np.float32(0))
     per_length = ones / lengths
     red, green, blue = v8.load_colours(pixels, at)
-    r = red
-    g = green
-    b = blue
-    edge = v8.minimum(opacity, ones - opacity) - v8.broadcast(np.float32(EDGE))
-    is_mixed = False
-    if splats.size > 0 and v8.has_nonnegative_lane(edge):
-        r, g, b = v8.load_colours(splats, Index(3) * pixel)
-        edge = v8.minimum(edge, green - g - v8.broadcast(np.float32(EDGE)))
-        is_mixed = v8.has_nonnegative_lane(edge)
-    edge = v8.at_least(edge, zeros)
+    (r, g, b), edge, is_mixed = surface_parts(splats, pixel, opacity, red, green, blue)
     red = _veil(v8.maximum(red, zeros), r, is_mixed, edge, light[0], opacity, surface, sky)
     green = _veil(v8.maximum(green, zeros), g, is_mixed, edge, light[1], opacity, surface, sky)
     blue = _veil(v8.maximum(blue, zeros), b, is_mixed, edge, light[2], opacity, surface, sky)
@@ -303,14 +298,7 @@ def _blend_row(
         u = u * v8.broadcast(rays[0])
         lengths = v8.sqrt(flat + u * u)
         z = v8.load(depth, pixel)
-        tau = v8.broadcast(slope) * z + v8.broadcast(offset)
-        for b in range(Index(count)):
-            inside = v8.maximum(z - v8.broadcast(partial[b, 1]), zeros)
-            inside = v8.minimum(inside, v8.broadcast(partial[b, 2]))
-            beyond = v8.maximum(z - v8.broadcast(partial[b, 4]), zeros)
-            tau = tau + v8.broadcast(partial[b, 0]) * (
-                inside * inside * v8.broadcast(partial[b, 3]) + beyond
-            )
+        tau = veil_depth(z, count, slope, offset, partial)
         tau = tau + v8.load(excess, Index(at))
         surface = (decay(tau * lengths), v8.load(veil_light, Index(at)))
         block = Index(j // NUM_LANES)
@@ -431,13 +419,8 @@ def blend_shower(
             first = Index((row - top) * width)
             for j in range(Index(width)):
                 mask[Index(row), j] = clear[first + j] < min_clear_share
-            v = (np.float32(row) + np.float32(0.5) - rays[3]) * rays[1]
-            for c in range(3):
-                light[c, 0] = airlight[c]
-                light[c, 1] = glow[c, 3]
-                light[c, 2] = glow[c, 0]
-                light[c, 3] = glow[c, 1] * v + glow[c, 2]
-                light[c, 4] = cloud[c]
+            light_of_row(row, rays, airlight, glow, light)
+            light[:, 4] = cloud
             _integrate_surfaces(row, width, depth, rays, table, axes, at_eye, excess, veil_light)
             if _shows_sky(row, width, alpha, depth):
                 _integrate_sky_row(row, width, rays, climb, table, axes, at_eye, lumps, eye, nodes)

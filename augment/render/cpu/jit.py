@@ -47,6 +47,7 @@ def _hash_sources() -> str:
         *sorted(folder.glob("*.py")),
         *sorted(render.glob("*_kernels.py")),
         render / "layout.py",
+        render / "fog_banks.py",
         *sorted((render.parent / "lamps").glob("*_kernels.py")),
         *sorted((render.parent / "effects" / "lamps").glob("*_kernels.py")),
         *sorted((render.parent / "effects" / "falling").glob("*_kernels.py")),
