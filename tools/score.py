@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from augment.errors import ScoreError
 from augment.output.atomic import write_atomic
 from augment.output.store import open_store
+from augment.scores.nuscenes_metric import NuScenesSplit
 from augment.scores.score_suite import ScoreOptions, score_suite
 from augment.scores.suite_facts import read_suite
 from augment.scores.suite_scores import SuiteScores
@@ -38,9 +39,14 @@ def score_predictions(options: ScoreCommand) -> int:
             categories=parse_categories(options.categories),
             kitti_view=options.kitti_view,
             kitti_difficulty=options.kitti_difficulty,
-            nuscenes_root=options.nuscenes,
-            nuscenes_version=options.nuscenes_version,
-            nuscenes_split=options.nuscenes_split,
+            nuscenes=None
+            if options.nuscenes is None
+            else NuScenesSplit(
+                options.nuscenes,
+                options.nuscenes_version,
+                options.nuscenes_split,
+                options.nuscenes_python,
+            ),
         ),
     )
     print("\n".join(score_lines(scores)))

@@ -8,7 +8,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -18,7 +17,8 @@ from augment.output.codecs import decode_png
 from augment.scene.semantics import SemanticClass
 from augment.scores.coco_metric import coco_average_precision
 from augment.scores.kitti_metric import DIFFICULTIES, KittiView, kitti_average_precision
-from augment.scores.predictions import Predictions
+from augment.scores.nuscenes_metric import NuScenesSplit, detection_score
+from augment.scores.predictions import RESULTS_FILE, Predictions
 from augment.scores.semantic_metric import class_overlaps, count_pixels
 from augment.scores.suite_facts import CLEAN_VARIANT, RenderedSuite
 from augment.scores.truth import SuiteTruth
@@ -161,25 +161,34 @@ class SemanticMetric:
 
 @dataclass(frozen=True, eq=False)
 class NuScenesMetric:
-    """nuScenes detection score, computed by nuscenes-devkit on a whole split."""
+    """nuScenes detection score, computed by nuscenes-devkit on a split."""
 
-    root: Path
-    """Folder of the nuScenes dataset, which has the annotations."""
-    version: str
-    """Version of its tables, such as v1.0-trainval."""
-    split: str
-    """Split whose samples the predictions have, such as val or mini_val."""
+    suite: RenderedSuite
+    """The suite."""
+    split: NuScenesSplit
+    """Samples that are scored."""
+    values: dict[tuple[str, tuple[str, ...]], MetricValue] = field(default_factory=dict)
+    """Values by the hash of the predictions and the names of the scenes that do not count."""
 
     @property
     def name(self) -> str:
         """Name of the metric."""
-        return f"NDS ({self.split})"
+        return f"NDS ({self.split.split})"
 
     def measure(self, predictions: Predictions, numbers: Sequence[int]) -> MetricValue:
-        """Return NDS on the split. The numbers of images do not matter."""
-        from augment.scores.nuscenes_metric import detection_score
+        """Return NDS on the scenes of the images of some numbers.
 
-        return MetricValue(*detection_score(predictions, self.root, self.version, self.split))
+        Raises:
+            ScoreError: The devkit is missing, or refuses the results.
+        """
+        scenes = {image.scene for image in self.suite.images}
+        omitted = tuple(sorted(scenes - {self.suite.images[number].scene for number in numbers}))
+        key = (predictions.content_hash, omitted)
+        if key not in self.values:
+            path = predictions.folder / RESULTS_FILE
+            score = detection_score(path, self.split, scenes, omitted)
+            self.values[key] = MetricValue(score.score, dict(score.by_class))
+        return self.values[key]
 
 
 def mean_of_categories(values: np.ndarray, names: Sequence[str]) -> MetricValue:

@@ -33,6 +33,7 @@ from augment.scores.metric_values import (
     NuScenesMetric,
     SemanticMetric,
 )
+from augment.scores.nuscenes_metric import NuScenesSplit
 from augment.scores.predictions import (
     ExpectedImages,
     PredictionKind,
@@ -89,12 +90,8 @@ class ScoreOptions:
     """Overlap of KITTI's AP."""
     kitti_difficulty: str = "moderate"
     """Difficulty of KITTI's AP: easy, moderate or hard."""
-    nuscenes_root: Path | None = None
-    """Folder of nuScenes, for NDS."""
-    nuscenes_version: str = "v1.0-trainval"
-    """Version of its tables."""
-    nuscenes_split: str = "val"
-    """Split whose samples the predictions have."""
+    nuscenes: NuScenesSplit | None = None
+    """Samples of nuScenes, for NDS."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,9 +254,9 @@ def _choose_metric(
         return KittiMetric(truth, options.kitti_view, options.kitti_difficulty)
     if kind == "semantic":
         return SemanticMetric(suite)
-    if options.nuscenes_root is None:
+    if options.nuscenes is None:
         raise ScoreError("nuScenes results need the dataset's annotations: --nuscenes PATH")
-    return NuScenesMetric(options.nuscenes_root, options.nuscenes_version, options.nuscenes_split)
+    return NuScenesMetric(suite, options.nuscenes)
 
 
 def _make_scores(run: _Run, folder: Path) -> SuiteScores:
@@ -571,8 +568,4 @@ def _notes(run: _Run) -> list[str]:
             notes.append(f"{effect} has no score: every scene was recorded in it")
     if len({image.scene for image in suite.images}) == 1 and run.hits:
         notes.append("one scene: V50 has no interval, which would be a bootstrap by scene")
-    if run.predictions[CLEAN_VARIANT].kind == "nuscenes":
-        notes.append(
-            "NDS is over the whole split: scenes that were recorded in an effect count, too"
-        )
     return notes
