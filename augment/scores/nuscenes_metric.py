@@ -7,6 +7,7 @@ Python is `augment/scores/nuscenes_evaluation.py`.
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -68,7 +69,9 @@ def detection_score(
         ScoreError: The Python has no nuscenes-devkit or cannot be run, or the devkit refuses the
             results, or the suite lacks scenes of the split.
     """
-    python = str(split.python or sys.executable)
+    named_python = str(split.python or sys.executable)
+    # The program runs in another folder, where a relative path would lead elsewhere.
+    python = str(Path(shutil.which(named_python) or named_python).absolute())
     with tempfile.TemporaryDirectory() as folder:
         request_path = Path(folder) / "request.json"
         answer_path = Path(folder) / "answer.json"

@@ -10,6 +10,7 @@ import json
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -126,6 +127,22 @@ def test_scenes_that_do_not_count_change_no_score(dataset, devkit_split, tmp_pat
 
 
 @pytest.mark.long
+def test_a_split_of_ones_own_needs_the_samples_of_its_scenes_alone(dataset, devkit_split, tmp_path):
+    path = write_results(tmp_path / "results.json", dataset)
+    content = json.loads(path.read_text())
+    scene_of_token = {row["token"]: row["name"] for row in read_table(dataset, "scene", VERSION)}
+    names = {
+        row["token"]: scene_of_token[row["scene_token"]]
+        for row in read_table(dataset, "sample", VERSION)
+    }
+    content["results"] = {t: b for t, b in content["results"].items() if names[t] == SCENES[1]}
+    path.write_text(json.dumps(content))
+    write_table(dataset, "splits", {"mine": [SCENES[1]]}, VERSION)
+    score = detection_score(path, replace(devkit_split, split="mine"), [SCENES[1]])
+    assert score.score == pytest.approx(score_by_hand(1.0, 0.0))
+
+
+@pytest.mark.long
 def test_the_devkit_refuses_results_that_lack_a_sample(dataset, devkit_split, tmp_path):
     path = write_results(tmp_path / "results.json", dataset)
     content = json.loads(path.read_text())
@@ -183,12 +200,14 @@ def write_program(path: Path, text: str) -> Path:
     return path
 
 
-def test_another_python_scores_the_scenes_that_count(dataset, tmp_path):
+def test_another_python_scores_the_scenes_that_count(dataset, tmp_path, monkeypatch):
     for name, text in STAND_IN.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
     text = f'#!/bin/sh\nPYTHONPATH={tmp_path} exec {sys.executable} "$@"\n'
-    split = NuScenesSplit(dataset, VERSION, "train", write_program(tmp_path / "python", text))
+    write_program(tmp_path / "python", text)
+    monkeypatch.chdir(tmp_path.parent)
+    split = NuScenesSplit(dataset, VERSION, "train", Path(tmp_path.name) / "python")
     path = write_results(tmp_path / "results.json", dataset)
     # Car and truck in three samples, a walker in two.
     assert detection_score(path, split, SCENES).score == 16
