@@ -708,6 +708,8 @@ class ScoreCommand(Command):
         nuscenes: The folder of nuScenes, for NDS by nuscenes-devkit.
         nuscenes_version: The version of its tables.
         nuscenes_split: The split whose samples the predictions have.
+        nuscenes_python: The Python that has nuscenes-devkit, if it is not this one: the devkit
+            needs an older NumPy.
         truth: Write the truth of each variant as a COCO file into this folder, with the numbers of
             images and categories, and score nothing.
         html: The page to write. By default PREDICTIONS/score.html.
@@ -724,6 +726,7 @@ class ScoreCommand(Command):
     nuscenes: Path | None = None
     nuscenes_version: str = "v1.0-trainval"
     nuscenes_split: str = "val"
+    nuscenes_python: Path | None = None
     truth: Path | None = None
     html: Path | None = None
     json_file: JsonFile = None

@@ -26,6 +26,7 @@ from augment.output.layout import (
 from augment.output.manifest import OK, read_manifest_rows
 from augment.output.names import MANIFEST_FILE, STATE_FOLDER, folder_name
 from augment.output.store import Store, StoredFileMissing
+from augment.suite.mirrored_files import find_mirrored_files
 from recipes.job import scaled_recipe
 from recipes.schema import Recipe
 from recipes.suite import CLEAN, Suite, SuiteVariant
@@ -319,7 +320,8 @@ def _scene_facts(request: SuiteRequest, rows: list[dict[str, Any]]) -> SceneFact
 
 
 def _suite_paths(store: Store, rows: list[dict[str, Any]]) -> list[str]:
-    """Return the paths of all files of a suite: those of its variants, sweeps, the manifest.
+    """Return the paths of all files of a suite: those of its variants, sweeps, the manifest, and
+    files in place of recorded ones in copies of datasets.
 
     Raises:
         OutputError: A file that the manifest names is missing.
@@ -339,7 +341,8 @@ def _suite_paths(store: Store, rows: list[dict[str, Any]]) -> list[str]:
             f"{store.uri}: {len(missing_paths)} files of the manifest are missing, the first of "
             f"them {missing_paths[0]}; start the suite again, which renders them"
         )
-    return [*paths, MANIFEST_FILE]
+    variants = {row["variant"] for row in rows}
+    return [*paths, *find_mirrored_files(store, stored_paths, variants), MANIFEST_FILE]
 
 
 def _folder_of(path: str, folders: set[str]) -> str | None:
