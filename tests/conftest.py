@@ -17,6 +17,7 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ["CLIMATEGS_SCENE_CACHE_GB"] = "0"  # tests build what they look at
 
+gc.disable()  # until all modules are imported: they make objects, and no garbage to speak of
 import pytest
 import torch
 from jaxtyping import config, install_import_hook
@@ -57,6 +58,7 @@ def pytest_collection_finish() -> None:
     """Spare the garbage collector what imports have made: jobs collect after every scene."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 # Files of a few long tests. At the end one of them would keep a single core busy.
