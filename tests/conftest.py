@@ -17,7 +17,6 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ["CLIMATEGS_SCENE_CACHE_GB"] = "0"  # tests build what they look at
 
-gc.disable()  # until all modules are imported: they make objects, and no garbage to speak of
 import pytest
 import torch
 from jaxtyping import config, install_import_hook
@@ -51,6 +50,7 @@ def _checked_modules() -> list[str]:
     return names
 
 
+gc.disable()  # until all tests are imported: imports make millions of objects and hardly garbage
 install_import_hook(_checked_modules(), "beartype.beartype")
 
 
