@@ -66,7 +66,8 @@ LONG = {
     f"test_{name}.py"
     for name in (
         "bench", "cli", "fit", "fit_report", "flood_view", "generate", "generate_ray",
-        "job_workers", "packages", "procedural", "render_backward", "snow_view", "store", "style",
+        "job_workers", "packages", "procedural", "prune", "reconstruct_updates", "render_backward",
+        "rendered_suite", "score_suite", "snow_view", "store", "style", "weather_over_time",
     )
 }  # fmt: skip
 
