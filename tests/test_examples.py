@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "docs" / "examples"
 # Examples that take some 10 s of processor time; the others take 6 s, most of it for imports.
-LONG_EXAMPLES = {"own_drive", "train_on_fog"}
+LONG_EXAMPLES = {"own_drive", "own_effect", "train_on_fog"}
 MAX_LINES = 64  # an example is read from top to bottom in a few minutes
 
 
