@@ -6,7 +6,7 @@ sweeps that stand in place of recorded ones. All other files of a copy are the d
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 
 from augment.jobs.mirror import MIRROR_FOLDER, RECORD_START, MirrorRecord
 from augment.output.layout import parse_errors_as_output_errors
@@ -16,14 +16,11 @@ from augment.output.store import Store
 _RECORD_END = ".json"
 
 
-def find_mirrored_files(
-    store: Store, stored_paths: Iterable[str], variants: Collection[str]
-) -> list[str]:
+def find_mirrored_files(store: Store, variants: Collection[str]) -> list[str]:
     """Return the paths of the files in place of recorded ones in complete copies of datasets.
 
     Args:
         store: The output.
-        stored_paths: Paths of all its files.
         variants: Names of the variants, such as `fog-3-000`.
 
     Raises:
@@ -31,7 +28,7 @@ def find_mirrored_files(
     """
     starts = tuple(f"{MIRROR_FOLDER}/{folder_name(name)}/{RECORD_START}" for name in variants)
     mirrored_paths = []
-    for path in stored_paths:
+    for path in store.list(MIRROR_FOLDER):
         start = next((start for start in starts if path.startswith(start)), None)
         if start is None or "/" in path[len(start) :] or not path.endswith(_RECORD_END):
             continue

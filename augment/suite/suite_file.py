@@ -26,7 +26,6 @@ from augment.output.layout import (
 from augment.output.manifest import OK, read_manifest_rows
 from augment.output.names import MANIFEST_FILE, STATE_FOLDER, folder_name
 from augment.output.store import Store, StoredFileMissing
-from augment.suite.mirrored_files import find_mirrored_files
 from recipes.job import scaled_recipe
 from recipes.schema import Recipe
 from recipes.suite import CLEAN, Suite, SuiteVariant
@@ -213,8 +212,15 @@ def check_same_suite(store: Store, request: SuiteRequest) -> None:
             )
 
 
-def describe_suite(store: Store, request: SuiteRequest) -> SuiteFile:
+def describe_suite(
+    store: Store, request: SuiteRequest, other_paths: Iterable[str] = ()
+) -> SuiteFile:
     """Return the facts of all images of a suite in an output, and hash its files.
+
+    Args:
+        store: The output.
+        request: Facts that the images do not state.
+        other_paths: Paths of files that belong to the suite besides those of its variants.
 
     Raises:
         OutputError: A file of the manifest is missing, or nothing is finished.
@@ -250,7 +256,7 @@ def describe_suite(store: Store, request: SuiteRequest) -> SuiteFile:
             for row in rows
             if row["status"] != OK
         ),
-        files=hash_files(store, _suite_paths(store, ok_rows)),
+        files=hash_files(store, [*_suite_paths(store, ok_rows), *other_paths]),
     )
 
 
@@ -320,8 +326,7 @@ def _scene_facts(request: SuiteRequest, rows: list[dict[str, Any]]) -> SceneFact
 
 
 def _suite_paths(store: Store, rows: list[dict[str, Any]]) -> list[str]:
-    """Return the paths of all files of a suite: those of its variants, sweeps, the manifest, and
-    files in place of recorded ones in copies of datasets.
+    """Return the paths of all files of a suite: those of its variants, sweeps, the manifest.
 
     Raises:
         OutputError: A file that the manifest names is missing.
@@ -341,8 +346,7 @@ def _suite_paths(store: Store, rows: list[dict[str, Any]]) -> list[str]:
             f"{store.uri}: {len(missing_paths)} files of the manifest are missing, the first of "
             f"them {missing_paths[0]}; start the suite again, which renders them"
         )
-    variants = {row["variant"] for row in rows}
-    return [*paths, *find_mirrored_files(store, stored_paths, variants), MANIFEST_FILE]
+    return [*paths, MANIFEST_FILE]
 
 
 def _folder_of(path: str, folders: set[str]) -> str | None:
