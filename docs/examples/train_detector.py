@@ -11,7 +11,7 @@ from augment import WeatherDataset
 from augment.dataset import torchvision_sample
 from tools.cli import main as climategs
 
-STREET = "procedural:street?seed=1&frames=25&speed_mps=20&parked=30&width=160&height=96"
+STREET = "procedural:street?seed=1&gaussians=60000&frames=25&speed_mps=20&width=160&height=96"
 RENDER = ["render", "clear", "--cameras", "front,front_left", "--scene", STREET, "--out"]
 
 

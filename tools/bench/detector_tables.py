@@ -40,7 +40,8 @@ class Hits:
 
 
 class Rise(NamedTuple):
-    """The largest rise of recall from one level of an effect to the next."""
+    """The largest rise of recall from one level of an effect to the next, or the surest one of
+    those whose interval lies above 0."""
 
     variant: str
     """The harsher variant of the two."""
@@ -114,6 +115,8 @@ def largest_rise(hits: Hits, variants: Sequence[str]) -> Rise:
     resampled = 100 * (weights @ differences) / np.maximum(weights @ hits.objects, 1)[:, None]
     intervals = [interval_ends(of_step) for of_step in resampled.T]
     num_significant = sum(lower > 0 for lower, _ in intervals)
+    if num_significant:  # the surest of those
+        step = int(np.argmax([lower for lower, _ in intervals]))
     return Rise(variants[step + 1], float(rises[step]), intervals[step], num_significant)
 
 
@@ -338,4 +341,4 @@ def draw_curves(path: Path, curves: Mapping[str, Any], titles: Mapping[str, str]
             axes.set_ylabel("recall, %")
         if number == 1:
             axes.legend(fontsize="x-small", loc="lower left")
-    figure.savefig(path, dpi=110, metadata={})
+    figure.savefig(path, dpi=110)
