@@ -45,6 +45,7 @@ SHOWS = {
     "own_drive": fades_to_the_right,
     "own_effect": is_sepia_far_away,
     "train_on_fog": predicts_the_road,
+    "weather_env": fades_to_the_right,
 }
 
 NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
