@@ -18,7 +18,6 @@ from recipes.load import parse_recipe
 
 STREET = "procedural:street?seed=3&gaussians=60000&frames=5&width=480&height=270"
 CLEAR = parse_recipe("version: 1\noutput: {depth: expected, semantic: true}\n", source="clear")
-SKY = 14  # number of the sky in StreetEnv's classes
 
 
 class StreetEnv(gymnasium.Env):
@@ -34,32 +33,30 @@ class StreetEnv(gymnasium.Env):
 
     def step(self, action):
         self.number += 1
-        return *self.observe()[:1], 0.0, False, False, self.observe()[1]
+        observation, info = self.observe()
+        return observation, 0.0, False, False, info
 
     def observe(self):
         camera = self.scene.frames[self.number].cameras["front"]
         view = render_view(self.scene, camera, CLEAR.resolve(0))
         images = {"rgb": view.rgb, "depth": view.depth_m, "semantic": view.semantic}
-        size = {"W": camera.width, "H": camera.height, "cx": camera.cx, "cy": camera.cy}
-        lens = {**size, "fx": camera.fx, "fy": camera.fy}
-        front = {"intrinsic": lens, "v2c": camera.camera_from_world.numpy()}
-        pose = {"ego_pos": np.zeros(3), "ego_rot": np.zeros(3), "timestamp": 0.1 * self.number}
-        return {k: {"front": v} for k, v in images.items()}, {
-            **pose,
-            "cam_params": {"front": front},
-        }
+        lens = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")}
+        lens |= {"W": camera.width, "H": camera.height}
+        info = {"ego_pos": [0, 0, 0], "ego_rot": [0, 0, 0], "timestamp": 0.1 * self.number}
+        pose = camera.camera_from_world.numpy()
+        info["cam_params"] = {"front": {"intrinsic": lens, "v2c": pose}}
+        return {kind: {"front": image} for kind, image in images.items()}, info
 
 
 def main(output_dir: Path) -> None:
     """Write weather_env.png: the street clear, and in the fog of the second step."""
     output_dir.mkdir(parents=True, exist_ok=True)
-    env = weather_env(StreetEnv(), "dense-fog", sky_classes=(SKY,))
+    env = weather_env(StreetEnv(), "dense-fog", sky_classes=(14,))  # the sky in StreetEnv
     env.reset(seed=7)
-    foggy, _, _, _, _ = env.step(env.action_space.sample())
-    clear, _ = env.unwrapped.observe()
+    foggy = env.step(env.action_space.sample())[0]
+    clear = env.unwrapped.observe()[0]
     path = output_dir / "weather_env.png"
-    pictures = np.hstack([clear["rgb"]["front"], foggy["rgb"]["front"]])
-    cv2.imwrite(str(path), pictures[..., ::-1])
+    cv2.imwrite(str(path), np.hstack([o["rgb"]["front"] for o in (clear, foggy)])[..., ::-1])
     print(f"picture: {path}")
 
 
