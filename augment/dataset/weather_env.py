@@ -109,7 +109,7 @@ class EnvWeather:
             raise SceneError(f"max_depth_m must be finite and > 0; got {max_depth_m}")
         self._recipe = recipe
         self._cameras_of = cameras_of
-        self._axes = axes
+        self._axes: Axes = axes
         self._depth = depth
         self._max_depth_m = max_depth_m
         self._sky_classes = sky_classes
