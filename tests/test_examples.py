@@ -53,6 +53,7 @@ SHOWS = {
     "robust_detector": fades_to_the_right,
     "train_detector": finds_the_cars,
     "train_on_fog": predicts_the_road,
+    "weather_env": fades_to_the_right,
 }
 
 NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
