@@ -13,7 +13,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 from augment.errors import AdapterError
 from augment.files.lens_records import optics_record
@@ -40,6 +40,39 @@ def with_recorded_frames(scene: Scene, recorded_frames: tuple[Frame, ...] | None
     return dataclasses.replace(scene, frames=recorded_frames, seen_frames=scene.frames)
 
 
+class LensFrames(NamedTuple):
+    """Frames of a drive whose images were recorded through lenses.
+
+    Attributes:
+        frames: pinhole cameras and undistorted images, from which the scene is made.
+        recorded_frames: lenses and images as recorded, for the scene; None if it keeps `frames`.
+        notes: sentences about the lenses.
+    """
+
+    frames: tuple[Frame, ...]
+    recorded_frames: tuple[Frame, ...] | None
+    notes: tuple[str, ...]
+
+
+def split_lenses(
+    name: str, frames: Sequence[Frame], lens: LensChoice, *, published: str
+) -> LensFrames:
+    """Return what a scene is made from, and what it shows.
+
+    Args:
+        name: name of the scene.
+        frames: frames with lenses and the images as recorded.
+        lens: the option.
+        published: the images in words, for the sentence that they have no lens.
+    """
+    if all(camera.is_pinhole for frame in frames for camera in frame.cameras.values()):
+        return LensFrames(tuple(frames), None, no_lens_note(published, lens))
+    pinholes, notes = pinhole_frames(name, frames)
+    if lens == RECORDED_LENS:
+        return LensFrames(pinholes, tuple(frames), ())
+    return LensFrames(pinholes, None, notes)
+
+
 def no_lens_note(images: str, lens: LensChoice) -> tuple[str, ...]:
     """Return a sentence if recorded lenses are asked for and the images are published without.
 
@@ -50,8 +83,8 @@ def no_lens_note(images: str, lens: LensChoice) -> tuple[str, ...]:
     if lens == UNDISTORTED_LENS:
         return ()
     return (
-        f"{images} are published undistorted and show no lens: lens=recorded changes nothing, the "
-        f"cameras are pinholes",
+        f"{images} show no lens distortion as they are: lens=recorded changes nothing, the cameras "
+        f"are pinholes",
     )
 
 

@@ -75,13 +75,7 @@ from adapters.raw_drive import (
     stored_records,
     usable_images,
 )
-from adapters.recorded_lenses import (
-    RECORDED_LENS,
-    UNDISTORTED_LENS,
-    LensChoice,
-    no_lens_note,
-    pinhole_frames,
-)
+from adapters.recorded_lenses import UNDISTORTED_LENS, LensChoice, split_lenses
 from adapters.uri import format_uri
 from augment.errors import AdapterError
 from augment.files.image_size import read_image_header
@@ -418,12 +412,14 @@ def read_kitti(path: str, query: dict[str, str], source: DriveSource) -> RawDriv
     ]
     images = usable_images(pictures)
     recorded_frames = tuple(_frame(source, images, number) for number in source.selection.numbers)
-    frames, copy_problems = pinhole_frames(source.name, recorded_frames)
-    lens_notes = copy_problems if not source.has_recorded_lens else ()
-    if not copy_problems:
-        lens_notes = no_lens_note(
-            "KITTI's images, which are rectified in all releases but `_extract`,", source.lens
-        )
+    lens_frames = split_lenses(
+        source.name,
+        recorded_frames,
+        source.lens,
+        published="KITTI's images, rectified in all releases but that before synchronisation "
+        "(`_extract`),",
+    )
+    frames = lens_frames.frames
     used = [frame for frame in frames if frame.index not in source.selection.held_out]
     sweeps, sweep_problems = _read_sweeps(labels, used)
     objects = find_objects(
@@ -442,12 +438,12 @@ def read_kitti(path: str, query: dict[str, str], source: DriveSource) -> RawDriv
         lidar_top_deg=_LIDAR_TOP_DEG,
         problems=(
             *source.problems,
-            *lens_notes,
+            *lens_frames.notes,
             *images.problems,
             *sweep_problems,
             *objects.problems,
         ),
-        recorded_frames=recorded_frames if copy_problems and source.has_recorded_lens else None,
+        recorded_frames=lens_frames.recorded_frames,
     )
 
 
@@ -548,11 +544,6 @@ class DriveSource:
     image_poses: Mapping[str, Mapping[int, np.ndarray]] = field(default_factory=dict)
     lens: LensChoice = UNDISTORTED_LENS
 
-    @property
-    def has_recorded_lens(self) -> bool:
-        """Return True if cameras keep their lenses."""
-        return self.lens == RECORDED_LENS
-
 
 def find_source(path: str, query: dict[str, str]) -> tuple[DriveSource, KittiOptions]:
     """Return the contents of the folder that the URI names, and its options."""
@@ -582,8 +573,8 @@ def _raw_source(root: Path, calibration_folder: Path, options: KittiOptions) -> 
         numbers = sorted(set(sweeps) & set(unsynced_times(root, VELODYNE)))
     if not sweeps:
         raise AdapterError(
-            f"{root / VELODYNE / 'data'} holds no sweep NNNNNNNNNN.bin or .txt; a scene cannot be built "
-            f"without them, unpack the drive again"
+            f"{root / VELODYNE / 'data'} holds no sweep NNNNNNNNNN.bin or .txt; a scene "
+            f"cannot be built without them, unpack the drive again"
         )
     selection = options.select(numbers, where=f"kitti:{root}")
     calibration = read_raw_calibration(calibration_folder, _image_sizes(root, images))

@@ -243,8 +243,8 @@ def write_copy(path: Path, data: bytes) -> None:
         os.replace(temporary, path)
     except OSError as error:
         raise AdapterError(
-            f"{path} cannot be written ({error.strerror or error}); images without distortion are kept there, set "
-            f"XDG_CACHE_HOME to a folder with room for them"
+            f"{path} cannot be written ({error.strerror or error}); images without distortion "
+            f"are kept there, set XDG_CACHE_HOME to a folder with room for them"
         ) from error
 
 
