@@ -97,31 +97,41 @@ def _recorded_pixels(
 
 
 def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
-    """Return an image as a pinhole camera would show it.
+    """Return an image as a pinhole camera would show it. Beyond the image its border is repeated.
 
     Args:
         image: the recorded image, [H, W, 3] or [H, W].
-        camera: the camera that recorded it, with its lens.
-        pinhole: a pinhole camera of the same pose.
+        camera: the camera that recorded it, with its lens, at the image's size.
+        pinhole: a pinhole camera at the same place, which may be turned.
     """
     assert camera.lens is not None
+    turn = camera.camera_from_world[:3, :3] @ pinhole.camera_from_world[:3, :3].T
+    rows = tuple(turn.flatten().tolist())
+    if torch.equal(camera.camera_from_world, pinhole.camera_from_world):
+        rows = tuple(np.eye(3).ravel().tolist())
     size = pinhole.width, pinhole.height
-    u, v = _maps(camera.lens, camera.intrinsics, pinhole.intrinsics, *size)
+    u, v = _maps(camera.lens, camera.intrinsics, pinhole.intrinsics, *size, rows)
     return cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
 @lru_cache(maxsize=16)
 def _maps(
-    lens: Lens, intrinsics: Intrinsics, pinhole: Intrinsics, width: int, height: int
+    lens: Lens,
+    intrinsics: Intrinsics,
+    pinhole: Intrinsics,
+    width: int,
+    height: int,
+    camera_from_pinhole: tuple[float, ...],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the recorded position of each undistorted pixel, as maps for cv2.remap.
 
-    Its pixel centres are whole numbers.
+    Its pixel centres are whole numbers. camera_from_pinhole is a rotation, row by row.
     """
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     x = (u - pinhole.cx) / pinhole.fx
     y = (v - pinhole.cy) / pinhole.fy
-    pixels, _ = lens.project(np.stack([x, y, np.ones_like(x)], -1), intrinsics)
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.reshape(camera_from_pinhole, (3, 3)).T
+    pixels, _ = lens.project(rays, intrinsics)
     pixels = np.nan_to_num(pixels - 0.5, nan=-1e6)
     return cv2.convertMaps(
         pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32), cv2.CV_16SC2

@@ -77,6 +77,8 @@ _THIN_LUMA_SHARE = 0.25
 # Radii of the windows over which the sky's colour is averaged, the narrowest that holds sky first,
 # pixels of half the working size.
 _SKY_WINDOWS_PX = (2, 8, 32)
+# Difference of a view from a recorded one that is rounding of its size, pixels.
+_MAX_VIEW_OFFSET_PX = 2.0
 # Weight of each window over the one before.
 _WINDOW_WEIGHT = 1e-3
 
@@ -103,7 +105,8 @@ def sky_matte(
 
     Args:
         scene: the scene.
-        camera: one of its cameras, at any scale.
+        camera: one of its cameras, at any scale; or a pinhole camera at the same place, through
+            which an image recorded with a lens is looked at. This needs `rgb`.
         rgb: the recorded image at the camera's size, if the caller has it; else it is read.
 
     Returns:
@@ -112,7 +115,12 @@ def sky_matte(
     frame = recorded_frame(scene, camera)
     if frame is None:
         return None
-    regions = recorded_sky_regions(scene, frame, camera.name)
+    if is_same_view(frame.cameras[camera.name], camera):
+        regions = recorded_sky_regions(scene, frame, camera.name)
+    elif rgb is not None:
+        regions = _regions_of_view(scene, frame, camera, rgb)
+    else:
+        return None
     if regions is None:
         return None
     if rgb is None:
@@ -122,7 +130,14 @@ def sky_matte(
         except ImageFault:
             return None
     image = rgb
-    key = "sky matte", frame.index, camera.name, camera.width, camera.height, camera.cx, camera.cy
+    numbers = camera.width, camera.height, camera.cx, camera.cy, camera.fx, camera.fy
+    key = (
+        "sky matte",
+        frame.index,
+        camera.name,
+        *numbers,
+        camera.camera_from_world.numpy().tobytes(),
+    )
     packed = memo_of(scene).get(key, lambda: _refine(image, regions))
     return SkyMatte(*unpack_matte(packed, image))
 
@@ -175,23 +190,58 @@ def _resize_returns(has_return: np.ndarray, height: int, width: int) -> np.ndarr
 
 
 def recorded_frame(scene: Scene, camera: Camera) -> Frame | None:
-    """Return the frame in which a camera recorded an image at this time and pose; None without."""
+    """Return the frame in which a camera recorded an image at this time and place; None without.
+
+    Where a scene shows images with their lenses, it is the frame with the undistorted copies.
+    """
 
     def index() -> dict[tuple[str, int], Frame]:
         return {
             (name, frame.cameras[name].timestamp_ns): frame
-            for frame in (*(scene.seen_frames or ()), *scene.frames)
+            for frame in (*scene.frames, *(scene.seen_frames or ()))
             for name in frame.image_paths
-            if name in frame.cameras
+            if name in frame.cameras and frame.cameras[name].is_pinhole
         }
 
     frames = memo_of(scene).get(("frames with images",), index)
     frame = frames.get((camera.name, camera.timestamp_ns))
     if frame is None:
         return None
-    pose = frame.cameras[camera.name].camera_from_world
-    is_same = torch.allclose(pose, camera.camera_from_world, rtol=0, atol=1e-6)
+    centre = frame.cameras[camera.name].centre
+    is_same = torch.allclose(centre, camera.centre, rtol=0, atol=1e-6)
     return frame if is_same else None
+
+
+def is_same_view(recorded: Camera, camera: Camera) -> bool:
+    """Return True if a camera at any scale, or a window of it, looks as the recorded one."""
+    if not torch.allclose(recorded.camera_from_world, camera.camera_from_world, rtol=0, atol=1e-6):
+        return False
+    scales = camera.fx / recorded.fx, camera.fy / recorded.fy
+    middle = (abs(recorded.cx * scales[0] - camera.cx), abs(recorded.cy * scales[1] - camera.cy))
+    sizes = (
+        abs(recorded.width * scales[0] - camera.width),
+        abs(recorded.height * scales[1] - camera.height),
+    )
+    return max(*middle, *sizes) <= _MAX_VIEW_OFFSET_PX
+
+
+def _regions_of_view(
+    scene: Scene, frame: Frame, camera: Camera, rgb: UInt8[np.ndarray, "H W 3"]
+) -> UInt8[np.ndarray, "m n"] | None:
+    """Return the kinds of the pixels of a view of a recorded image, as `find_sky_regions`.
+
+    Args:
+        scene: the scene.
+        frame: the frame of the image.
+        camera: the view, at the image's place.
+        rgb: the image in the view.
+    """
+    points = sweep_of(scene, frame.index)
+    if points is None:
+        return find_regions(rgb, camera)
+    small = camera.scaled(min(1.0, WORK_WIDTH / camera.width))
+    top_rad = highest_channel_rad(scene, points, small)
+    return find_regions(rgb, camera, find_returns(points, small), top_rad)
 
 
 def recorded_sky_regions(scene: Scene, frame: Frame, name: str) -> UInt8[np.ndarray, "m n"] | None:

@@ -20,9 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 from scipy.interpolate import RectBivariateSpline
-from torch import Tensor
 
 from augment.scene.cameras import Camera
 from augment.scene.geometry import rigid
