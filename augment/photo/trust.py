@@ -46,6 +46,7 @@ from augment.render.constants import SURFACE_ALPHA
 from augment.render.rasterize import rasterize
 from augment.scene.cameras import Camera, Frame
 from augment.scene.labels import EGO_VEHICLE
+from augment.scene.pinhole_scene import pinhole_scene
 from augment.scene.scene import Scene
 
 # Distance from which a surface before the sky fades in any fog and casts no pane, metres.
@@ -873,7 +874,11 @@ def judge_scene(
             are not drawn.
         backend: the rasteriser's backend.
     """
-    frames = scene.frames if frames is None else frames
+    pinholes = pinhole_scene(scene)
+    pinhole_frames = {frame.index: frame for frame in pinholes.frames}
+    judged_frames = scene.frames if frames is None else frames
+    frames = [pinhole_frames.get(frame.index, frame) for frame in judged_frames]
+    scene = pinholes
     names = dict.fromkeys(name for frame in frames for name in frame.cameras)
     chosen_names = [name for name in names if cameras is None or name in cameras]
     judged_cameras = tuple(
