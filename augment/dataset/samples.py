@@ -331,10 +331,10 @@ def collate_frames(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     Images and buffers of one size are stacked to [N, ...]. Of unlike sizes they stay a list, as do
     masks of water and snow where a sample has none. Cameras have K [N, 3, 3], world_from_camera and
-    world_from_ego [N, 4, 4], int64 [N] tensors, and lists of names, lenses and
-    shutters. Weather is float64 [N] per number, NaN where a sample lacks it. Everything else, boxes above all, is a list with one entry
-    a sample. Clips gain the same dimension in front: image [N, T, C, 3, H, W], K [N, T, C, 3, 3],
-    frame [N, T]. Pairs become a dictionary of two batches.
+    world_from_ego [N, 4, 4], int64 [N] tensors, and lists of names, lenses and shutters. Weather is
+    float64 [N] per number, NaN where a sample lacks it. Everything else, boxes above all, is a list
+    with one entry a sample. Clips gain the same dimension in front: image [N, T, C, 3, H, W],
+    K [N, T, C, 3, 3], frame [N, T]. Pairs become a dictionary of two batches.
 
     Raises:
         ValueError: some samples have an image or buffer that others lack, masks excepted: datasets

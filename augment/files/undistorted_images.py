@@ -134,7 +134,8 @@ def _recorded_pixels(
     assert camera.lens is not None
     x = (u - pinhole.cx) / pinhole.fx
     y = (v - pinhole.cy) / pinhole.fy
-    return camera.lens.project(np.stack([x, y, np.ones_like(x)], -1), camera.intrinsics)
+    rays = np.stack([x, y, np.ones_like(x)], -1).astype(np.float64)
+    return camera.lens.project(rays, camera.intrinsics)
 
 
 def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
@@ -172,7 +173,7 @@ def _maps(
     x = (u - pinhole.cx) / pinhole.fx
     y = (v - pinhole.cy) / pinhole.fy
     rays = np.stack([x, y, np.ones_like(x)], -1) @ np.reshape(camera_from_pinhole, (3, 3)).T
-    pixels, _ = lens.project(rays, intrinsics)
+    pixels, _ = lens.project(rays.astype(np.float64), intrinsics)
     pixels = np.nan_to_num(pixels - 0.5, nan=-1e6)
     return cv2.convertMaps(
         pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32), cv2.CV_16SC2
