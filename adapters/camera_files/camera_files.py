@@ -530,8 +530,8 @@ def read_views(path: Path, *, has_lenses: bool = False) -> ViewSet:
             f"{path}: no cameras in this folder; looked for {', '.join(_JSON_NAMES)} and a COLMAP "
             "sparse model (cameras and images, .bin or .txt) in it, sparse/0 and sparse"
         )
-    read = read_colmap_views if camera_file.is_dir() else read_camera_json
-    return read(camera_file, has_lenses=has_lenses)
+    read_file = read_colmap_views if camera_file.is_dir() else read_camera_json
+    return read_file(camera_file, has_lenses=has_lenses)
 
 
 def find_camera_file(folder: Path) -> Path | None:
