@@ -225,7 +225,11 @@ def _write_folder(
     """Write the description of the copies, and return their folder."""
     from adapters.scene_cache import image_folder  # which imports the list of datasets
 
-    texts = sorted(f"{folder} {_optics_text(pair[0])}" for folder, pair in cameras.items())
+    # Copies of another size, as an earlier version may have left them, are not taken for these.
+    texts = sorted(
+        f"{folder} {_optics_text(camera)} {_optics_text(pinhole)}"
+        for folder, (camera, pinhole) in cameras.items()
+    )
     digest = hashlib.sha256(json.dumps(texts).encode()).hexdigest()[:8]
     paths = [Path(source) for source in sources.values()]
     folder = image_folder(f"{folder_name(name)}-{digest}", paths)
