@@ -77,6 +77,8 @@ _THIN_LUMA_SHARE = 0.25
 # Radii of the windows over which the sky's colour is averaged, the narrowest that holds sky first,
 # pixels of half the working size.
 _SKY_WINDOWS_PX = (2, 8, 32)
+# Least share of a view that the undistorted copy of its image shows for the copy's sky to count.
+_MIN_COPY_SHARE = 0.7
 # Difference of a view from a recorded one that is rounding of its size, pixels.
 _MAX_VIEW_OFFSET_PX = 2.0
 # Weight of each window over the one before.
@@ -105,8 +107,7 @@ def sky_matte(
 
     Args:
         scene: the scene.
-        camera: one of its cameras, at any scale; or a pinhole camera at the same place, through
-            which an image recorded with a lens is looked at. This needs `rgb`.
+        camera: one of its cameras, at any scale.
         rgb: the recorded image at the camera's size, if the caller has it; else it is read.
 
     Returns:
@@ -115,12 +116,9 @@ def sky_matte(
     frame = recorded_frame(scene, camera)
     if frame is None:
         return None
-    if is_same_view(frame.cameras[camera.name], camera):
-        regions = recorded_sky_regions(scene, frame, camera.name)
-    elif rgb is not None:
-        regions = _regions_of_view(scene, frame, camera, rgb)
-    else:
+    if not is_same_view(frame.cameras[camera.name], camera):
         return None
+    regions = recorded_sky_regions(scene, frame, camera.name)
     if regions is None:
         return None
     if rgb is None:
@@ -225,23 +223,76 @@ def is_same_view(recorded: Camera, camera: Camera) -> bool:
     return max(*middle, *sizes) <= _MAX_VIEW_OFFSET_PX
 
 
-def _regions_of_view(
-    scene: Scene, frame: Frame, camera: Camera, rgb: UInt8[np.ndarray, "H W 3"]
-) -> UInt8[np.ndarray, "m n"] | None:
-    """Return the kinds of the pixels of a view of a recorded image, as `find_sky_regions`.
+def sky_matte_of_view(
+    scene: Scene, frame: Frame, lens_camera: Camera, view: Camera, rgb: UInt8[np.ndarray, "H W 3"]
+) -> SkyMatte | None:
+    """Return the sky matte of an image that was recorded through a lens, in a pinhole view of it.
 
     Args:
         scene: the scene.
         frame: the frame of the image.
-        camera: the view, at the image's place.
+        lens_camera: the camera with its lens, at the view's place.
+        view: the view.
         rgb: the image in the view.
     """
+    numbers = view.width, view.height, *view.intrinsics
+    pose = view.camera_from_world.numpy().tobytes()
+    key = "sky matte of view", frame.index, view.name, *numbers, pose
+
+    def make() -> tuple[PackedMatte | None]:  # a value that is None would be made again
+        small = view.scaled(min(1.0, WORK_WIDTH / view.width))
+        kinds = _kinds_of_copy(scene, frame, lens_camera, small)
+        if kinds is None:
+            kinds = _kinds_in_view(scene, frame, small, rgb)
+        return (None if kinds is None else _refine(rgb, kinds),)
+
+    packed = memo_of(scene).get(key, make)[0]
+    return None if packed is None else SkyMatte(*unpack_matte(packed, rgb))
+
+
+def _kinds_of_copy(
+    scene: Scene, frame: Frame, lens_camera: Camera, view: Camera
+) -> UInt8[np.ndarray, "h w"] | None:
+    """Return the kinds of pixels that the undistorted copy of an image tells of a view.
+
+    Beyond the copy the nearest pixel counts. None where there is no copy, where it is too dark, or
+    where the view lies beside it.
+    """
+    of_frame = (f for f in scene.seen_frames or () if f.index == frame.index)
+    copy_frame = next(of_frame, None)
+    copy = None if copy_frame is None else copy_frame.cameras.get(view.name)
+    if copy_frame is None or copy is None or not copy.is_pinhole:
+        return None
+    kinds = recorded_sky_regions(scene, copy_frame, view.name)
+    if kinds is None:
+        return None
+    # The lens and its copy are of one camera, whatever the pose of a strip of the image.
+    turn = (lens_camera.camera_from_world[:3, :3] @ view.camera_from_world[:3, :3].T).numpy()
+    small = copy.resized(kinds.shape[1], kinds.shape[0])
+    columns, rows = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    x = (columns - view.cx) / view.fx
+    y = (rows - view.cy) / view.fy
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ turn.T
+    z = np.maximum(rays[..., 2], 1e-6)
+    u = np.floor(small.fx * rays[..., 0] / z + small.cx)
+    v = np.floor(small.fy * rays[..., 1] / z + small.cy)
+    is_inside = (rays[..., 2] > 0) & (u >= 0) & (u < small.width) & (v >= 0) & (v < small.height)
+    if is_inside.mean() < _MIN_COPY_SHARE:
+        return None
+    last_row = small.height - 1
+    last_column = small.width - 1
+    return kinds[v.clip(0, last_row).astype(int), u.clip(0, last_column).astype(int)]
+
+
+def _kinds_in_view(
+    scene: Scene, frame: Frame, view: Camera, rgb: UInt8[np.ndarray, "H W 3"]
+) -> UInt8[np.ndarray, "h w"] | None:
+    """Return the kinds of pixels that the image itself tells, as `find_sky_regions`."""
     points = sweep_of(scene, frame.index)
     if points is None:
-        return find_regions(rgb, camera)
-    small = camera.scaled(min(1.0, WORK_WIDTH / camera.width))
-    top_rad = highest_channel_rad(scene, points, small)
-    return find_regions(rgb, camera, find_returns(points, small), top_rad)
+        return find_regions(rgb, view)
+    top_rad = highest_channel_rad(scene, points, view)
+    return find_regions(rgb, view, find_returns(points, view), top_rad)
 
 
 def recorded_sky_regions(scene: Scene, frame: Frame, name: str) -> UInt8[np.ndarray, "m n"] | None:
