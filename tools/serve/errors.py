@@ -20,7 +20,15 @@ class RequestRefused(ClimateGSError):
 
 
 class RequestEnded(Exception):
-    """The client has cancelled the request, or its deadline has passed."""
+    """The client has cancelled the request, or its deadline has passed.
+
+    Attributes:
+        code: the gRPC status.
+    """
+
+    def __init__(self, code: grpc.StatusCode, text: str) -> None:
+        super().__init__(text)
+        self.code = code
 
 
 def invalid(text: str) -> RequestRefused:

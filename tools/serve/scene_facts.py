@@ -88,6 +88,10 @@ def _rig_camera(scene: Scene, rig: Track | None, name: str) -> RigCamera:
     own time.
     """
     frames = [frame for frame in scene.frames if name in frame.cameras]
+    # Before the first and after the last frame, the car's pose is not known.
+    first_ns = scene.frames[0].timestamp_ns
+    last_ns = scene.frames[-1].timestamp_ns
+    frames = [f for f in frames if first_ns <= f.cameras[name].timestamp_ns <= last_ns] or frames
     frame = frames[len(frames) // 2]
     camera = frame.cameras[name]
     world_from_rig = None if rig is None else rig.pose_at(camera.timestamp_ns)

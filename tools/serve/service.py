@@ -73,10 +73,14 @@ class Call:
     def check(self) -> None:
         """Raise RequestEnded if nobody waits for the response any more."""
         if not self._context.is_active():
-            raise RequestEnded("the client has cancelled the request, or is gone")
+            raise RequestEnded(
+                grpc.StatusCode.CANCELLED, "the client has cancelled the request, or is gone"
+            )
         remaining_s = self._context.time_remaining()
         if remaining_s is not None and remaining_s <= 0:
-            raise RequestEnded("the deadline of the request has passed")
+            raise RequestEnded(
+                grpc.StatusCode.DEADLINE_EXCEEDED, "the deadline of the request has passed"
+            )
 
 
 @dataclass(frozen=True)
@@ -166,10 +170,8 @@ class SensorService:
             response = b""
             try:
                 response = self._respond(method, data, call)
-            except RequestRefused as error:
+            except (RequestRefused, RequestEnded) as error:
                 code, text = error.code, str(error)
-            except RequestEnded as error:
-                code, text = grpc.StatusCode.CANCELLED, str(error)
             except (ClimateGSError, RecipeError) as error:
                 code, text = grpc.StatusCode.FAILED_PRECONDITION, str(error)
             except MemoryError:
