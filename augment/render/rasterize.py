@@ -124,6 +124,7 @@ def rasterize(
         ValueError, TypeError: no backend, or not the named one, can take an argument.
         BackendUnavailable: the named backend cannot run on this machine.
     """
+    camera.check_no_lens("drawing splats")
     _check_arguments(parts, camera, buffers, settings)
     _check_devices(parts, backend)
     if fog is not None and camera.is_orthographic:

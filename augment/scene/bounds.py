@@ -152,6 +152,7 @@ def _half_spaces(camera: Camera, near_m: float) -> tuple[np.ndarray, np.ndarray,
     Returns:
         sides [5, 3], offsets [5] and reach [5].
     """
+    camera.check_no_lens("planes around its view")
     focal = np.array([camera.fx, camera.fy])
     centre = np.array([camera.cx, camera.cy])
     size = np.array([camera.width, camera.height], np.float64)
