@@ -7,7 +7,7 @@ from typing import Any
 import grpc
 
 from augment.scene.cameras import Camera
-from tools.serve.cameras import camera_spec
+from tools.serve.lens_specs import camera_spec
 from tools.serve.messages import enum_numbers, message_class
 from tools.serve.poses import pose_message
 

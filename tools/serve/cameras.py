@@ -1,21 +1,21 @@
-"""Cameras of requests, and camera specifications of a scene's cameras.
-
-Principal points count from the outer corner of the first pixel, as ours do (pixel centres at +0.5).
-"""
+"""Cameras of requests, and a scene's cameras as clients get them."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
+import grpc
 from torch import Tensor
 
 from augment.errors import SceneError
 from augment.scene.cameras import Camera, check_lens
 from augment.scene.geometry import invert_rigid
+from augment.scene.shutter import interpolate_pose
 from tools.serve.errors import RequestRefused, invalid, shown
-from tools.serve.messages import enum_numbers, message_class
+from tools.serve.lens_specs import camera_spec, read_lens
+from tools.serve.messages import message_class
 from tools.serve.poses import is_within_rounding, pose_message, pose_pair
 from tools.serve.scene_facts import NS_PER_US, RigCamera, SceneFacts
 
@@ -27,19 +27,6 @@ _SAME_INTRINSICS = 1e-9
 _MAX_EXPOSURE_US = 1_000_000
 # Length of a camera's name, at most, characters.
 _MAX_NAME_LENGTH = 200
-
-
-class _Intrinsics(NamedTuple):
-    """Numbers of a camera's image."""
-
-    fx: float
-    """Focal length along x, pixels."""
-    fy: float
-    """Focal length along y, pixels."""
-    cx: float
-    """Column of the principal point, pixels."""
-    cy: float
-    """Row of the principal point, pixels."""
 
 
 def requested_camera(request: Any, facts: SceneFacts, max_pixels: int) -> Camera:
@@ -69,17 +56,22 @@ def requested_camera(request: Any, facts: SceneFacts, max_pixels: int) -> Camera
     start, end = pose_pair(request.sensor_pose, "sensor_pose")
     spec_width = spec.resolution_w or width
     spec_height = spec.resolution_h or height
-    intrinsics = _intrinsics(spec)
+    numbers = read_lens(spec)
     try:
         camera = Camera(
             name,
             spec_width,
             spec_height,
-            *intrinsics,
-            camera_from_world=invert_rigid(_middle_pose(start, end)),
+            fx=numbers.fx,
+            fy=numbers.fy,
+            cx=numbers.cx,
+            cy=numbers.cy,
+            camera_from_world=_camera_from_world(start, end),
             timestamp_ns=timestamp_us * NS_PER_US,
+            lens=numbers.lens,
         )
         check_lens(camera, f"camera {shown(name)}")
+        camera.check_no_lens("images of this server")
     except (ValueError, SceneError) as error:
         raise invalid(f"camera_intrinsics: {error}") from error
     recorded = facts.image_cameras.get((name, timestamp_us))
@@ -130,8 +122,6 @@ def _middle_us(request: Any, facts: SceneFacts) -> int:
 
 def check_time(timestamp_ns: int, facts: SceneFacts) -> None:
     """Refuse a time far from a scene's drive, whose weather nobody means."""
-    import grpc
-
     first_ns = facts.start_ns - MAX_TIME_BEYOND_DRIVE_NS
     last_ns = facts.end_ns + MAX_TIME_BEYOND_DRIVE_NS
     if not first_ns <= timestamp_ns <= last_ns:
@@ -143,45 +133,16 @@ def check_time(timestamp_ns: int, facts: SceneFacts) -> None:
         )
 
 
-def _middle_pose(start: Tensor, end: Tensor) -> Tensor:
-    """Return the pose in the middle between two."""
+def _camera_from_world(start: Tensor, end: Tensor) -> Tensor:
+    """Return the inverse of the pose in the middle between two."""
     if start is end:
-        return start
-    from augment.scene.geometry import quat_from_rotmat, rigid, rotmat_from_quat
-
-    first = quat_from_rotmat(start[:3, :3])
-    second = quat_from_rotmat(end[:3, :3])
-    second = second if float(first @ second) >= 0 else -second
-    return rigid(rotmat_from_quat(first + second), (start[:3, 3] + end[:3, 3]) / 2)
-
-
-def _intrinsics(spec: Any) -> _Intrinsics:
-    """Return the numbers of a specification."""
-    if spec.WhichOneof("external_distortion") is not None:
-        raise invalid(
-            "camera_intrinsics.bivariate_windshield_model_param: a windshield's distortion cannot "
-            "be drawn; leave it out, or undistort for it on the client's side"
-        )
-    kind = spec.WhichOneof("camera_param")
-    if kind is None:
-        raise invalid(
-            "camera_intrinsics has no lens: set opencv_pinhole_param, opencv_fisheye_param or "
-            "ftheta_param (get_available_cameras has those of the scene's cameras)"
-        )
-    param = getattr(spec, kind)
-    if kind != "opencv_pinhole_param":
-        raise invalid(f"camera_intrinsics.{kind}: this lens cannot be drawn; use a pinhole")
-    distortion = [*param.radial_coeffs, *param.tangential_coeffs, *param.thin_prism_coeffs]
-    if any(distortion):
-        raise invalid("camera_intrinsics.opencv_pinhole_param: distortion cannot be drawn")
-    return _Intrinsics(
-        param.focal_length_x, param.focal_length_y, param.principal_point_x, param.principal_point_y
-    )
+        return invert_rigid(start)
+    return interpolate_pose(invert_rigid(start), invert_rigid(end), 0.5)
 
 
 def _has_same_intrinsics(first: Camera, second: Camera) -> bool:
-    """Return True if two cameras of the same size have the same numbers."""
-    return all(
+    """Return True if two cameras of the same size have the same numbers and lens."""
+    return first.lens == second.lens and all(
         math.isclose(a, b, rel_tol=_SAME_INTRINSICS)
         for a, b in (
             (first.fx, second.fx),
@@ -200,23 +161,4 @@ def available_camera(rig_camera: RigCamera) -> Any:
         intrinsics=camera_spec(camera),
         rig_to_camera=pose_message(rig_camera.rig_from_camera),
         logical_id=camera.name,
-    )
-
-
-def camera_spec(camera: Camera) -> Any:
-    """Return the `CameraSpec` of a camera."""
-    return message_class("CameraSpec")(
-        logical_id=camera.name,
-        resolution_h=camera.height,
-        resolution_w=camera.width,
-        shutter_type=enum_numbers("ShutterType")["GLOBAL"],
-        opencv_pinhole_param={
-            "principal_point_x": camera.cx,
-            "principal_point_y": camera.cy,
-            "focal_length_x": camera.fx,
-            "focal_length_y": camera.fy,
-            "radial_coeffs": [0.0] * 6,
-            "tangential_coeffs": [0.0] * 2,
-            "thin_prism_coeffs": [0.0] * 4,
-        },
     )
