@@ -1,4 +1,4 @@
-"""A closed loop against `climategs serve`: six cameras, ten steps a second, beside the recorded line.
+"""A closed loop against `climategs serve`: six cameras, ten steps a second, off the recorded line.
 
 Run it with: python docs/examples/closed_loop.py OUTPUT_FOLDER
 It starts the server of a small street. The car leaves the recorded line by up to 2 m, as under a
