@@ -56,8 +56,8 @@ def serve_scenes(options: ServeOptions) -> int:
         print_note("stopping: requests in flight are finished; interrupt again to give them up")
         running.stop(_GRACE_S)
     facts = running.metrics.facts()
-    print(metrics_text(facts))
     write_json(options.metrics, facts)
+    print_note(metrics_text(facts))
     return 0
 
 
