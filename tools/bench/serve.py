@@ -2,7 +2,7 @@
 
 `measure` returns two tables.
 1. Images a second, and processor time an image, of six cameras a step by `batch_render_rgb` and of
-   the same images by a job, in turns.
+   the same images by a job that writes nothing else, in turns.
 2. A soak: clients replay a closed loop, each step of all cameras, with the car beside the recorded
    line. Latencies of a step, and the server's memory.
 """
@@ -33,6 +33,15 @@ from tools.serve.messages import MAX_MESSAGE_BYTES, Stub, enum_numbers, message_
 from tools.serve.poses import pose_matrix, pose_message
 from tools.serve.server import served_recipes, start_service
 
+# Outputs of the recipe in the comparison: a job writes nothing else, as the service sends nothing
+# else.
+IMAGES_ONLY = (
+    "output.labels=false",
+    "output.lidar=false",
+    "output.depth=none",
+    "output.semantic=false",
+    "output.instance=false",
+)
 # Distance between the car and the recorded line, at most, metres.
 MAX_ASIDE_M = 2.0
 # Steps in which the car swings from one side of the line to the other.
@@ -169,7 +178,7 @@ def _channel(port: int) -> Any:
 def _measure_rate(case: ServeCase) -> Figures:
     """Return the images a second and the processor time of the service and of a job."""
     options = ServeOptions(scenes=(f"scene={case.scene}",), recipe=(case.recipe,), port=0)
-    recipes = served_recipes(options.recipe, 1, ())
+    recipes = served_recipes(options.recipe, 1, IMAGES_ONLY)
     with (
         start_service(options, recipes) as running,
         running.store.borrow("scene") as (opened, recipe),

@@ -12,9 +12,9 @@ from torch import Tensor
 from augment.errors import SceneError
 from augment.scene.cameras import Camera, check_lens
 from augment.scene.geometry import invert_rigid
-from augment.scene.shutter import interpolate_pose
+from augment.scene.shutter import RollingShutter, interpolate_pose
 from tools.serve.errors import RequestRefused, invalid, shown
-from tools.serve.lens_specs import camera_spec, read_lens
+from tools.serve.lens_specs import camera_spec, read_lens, read_out
 from tools.serve.messages import message_class
 from tools.serve.poses import is_within_rounding, pose_message, pose_pair
 from tools.serve.scene_facts import NS_PER_US, RigCamera, SceneFacts
@@ -57,6 +57,7 @@ def requested_camera(request: Any, facts: SceneFacts, max_pixels: int) -> Camera
     spec_width = spec.resolution_w or width
     spec_height = spec.resolution_h or height
     numbers = read_lens(spec)
+    exposure_us = request.frame_end_us - request.frame_start_us
     try:
         camera = Camera(
             name,
@@ -69,16 +70,17 @@ def requested_camera(request: Any, facts: SceneFacts, max_pixels: int) -> Camera
             camera_from_world=_camera_from_world(start, end),
             timestamp_ns=timestamp_us * NS_PER_US,
             lens=numbers.lens,
+            shutter=_shutter(spec, start, end, exposure_us),
         )
         check_lens(camera, f"camera {shown(name)}")
-        camera.check_no_lens("images of this server")
     except (ValueError, SceneError) as error:
         raise invalid(f"camera_intrinsics: {error}") from error
     recorded = facts.image_cameras.get((name, timestamp_us))
-    if recorded is not None and start is end:
+    if recorded is not None:
         recorded = recorded.resized(spec_width, spec_height)
         is_same_pose = is_within_rounding(camera.world_from_camera, recorded.world_from_camera)
-        if is_same_pose and _has_same_intrinsics(camera, recorded):
+        is_same_shutter = _is_same_shutter(camera.shutter, recorded.shutter)
+        if is_same_pose and is_same_shutter and _has_same_intrinsics(camera, recorded):
             camera = recorded
         elif recorded.timestamp_ns != camera.timestamp_ns:
             # Digits below a microsecond choose the colours and moving objects of the image.
@@ -138,6 +140,31 @@ def _camera_from_world(start: Tensor, end: Tensor) -> Tensor:
     if start is end:
         return invert_rigid(start)
     return interpolate_pose(invert_rigid(start), invert_rigid(end), 0.5)
+
+
+def _shutter(spec: Any, start: Tensor, end: Tensor, exposure_us: int) -> RollingShutter | None:
+    """Return the shutter of a moving camera whose rows or columns are read one after another."""
+    direction = read_out(spec)
+    if direction is None or start is end or exposure_us < 2:
+        return None
+    return RollingShutter.between(
+        invert_rigid(start),
+        invert_rigid(end),
+        read_out=direction,
+        duration_ns=exposure_us * NS_PER_US,
+    )
+
+
+def _is_same_shutter(first: RollingShutter | None, second: RollingShutter | None) -> bool:
+    """Return True if two shutters are the same within the rounding of messages."""
+    if first is None or second is None:
+        return first is second
+    return (
+        first.read_out == second.read_out
+        and abs(first.duration_ns - second.duration_ns) <= 2 * NS_PER_US
+        and is_within_rounding(first.start_from_camera, second.start_from_camera)
+        and is_within_rounding(first.end_from_camera, second.end_from_camera)
+    )
 
 
 def _has_same_intrinsics(first: Camera, second: Camera) -> bool:
