@@ -13,7 +13,7 @@ from augment.errors import SceneError
 from augment.scene.cameras import Camera, check_lens
 from augment.scene.geometry import invert_rigid
 from augment.scene.shutter import RollingShutter, interpolate_pose
-from tools.serve.errors import RequestRefused, invalid, shown
+from tools.serve.errors import RequestRefused, invalid, quote_text
 from tools.serve.lens_specs import camera_spec, read_lens, read_out
 from tools.serve.messages import message_class
 from tools.serve.poses import is_within_rounding, pose_message, pose_pair
@@ -72,7 +72,7 @@ def requested_camera(request: Any, facts: SceneFacts, max_pixels: int) -> Camera
             lens=numbers.lens,
             shutter=_shutter(spec, start, end, exposure_us),
         )
-        check_lens(camera, f"camera {shown(name)}")
+        check_lens(camera, f"camera {quote_text(name)}")
     except (ValueError, SceneError) as error:
         raise invalid(f"camera_intrinsics: {error}") from error
     recorded = facts.image_cameras.get((name, timestamp_us))

@@ -41,6 +41,6 @@ def unimplemented(text: str) -> RequestRefused:
     return RequestRefused(grpc.StatusCode.UNIMPLEMENTED, text)
 
 
-def shown(text: str) -> str:
+def quote_text(text: str) -> str:
     """Return a client's text for messages and logs: printable, at most 80 characters."""
     return repr(text if len(text) <= 80 else text[:77] + "...")

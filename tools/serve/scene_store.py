@@ -32,7 +32,7 @@ from recipes.fields import with_unchecked_field
 from recipes.files import with_digest
 from recipes.schema import Recipe
 from tools.output import print_note
-from tools.serve.errors import RequestRefused, shown
+from tools.serve.errors import RequestRefused, quote_text
 from tools.serve.scene_facts import SceneFacts, facts_of
 
 # Sign between a scene's name and a recipe's.
@@ -230,13 +230,13 @@ class SceneStore:
         if entry is None:
             raise RequestRefused(
                 grpc.StatusCode.NOT_FOUND,
-                f"there is no scene {shown(name)}; this server has {_listed(self.scene_names)}",
+                f"there is no scene {quote_text(name)}; this server has {_listed(self.scene_names)}",
             )
         suffixes = [offered.suffix for offered in self._offered]
         if sign + weather not in suffixes:
             raise RequestRefused(
                 grpc.StatusCode.NOT_FOUND,
-                f"scene {name!r} is not offered in the weather {shown(sign + weather)}; choose "
+                f"scene {name!r} is not offered in the weather {quote_text(sign + weather)}; choose "
                 f"from {_listed([s for s in suffixes if s])}, or name the scene alone",
             )
         return entry, sign + weather

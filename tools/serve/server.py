@@ -249,9 +249,9 @@ def _ready_text(options: ServeOptions, running: RunningService) -> str:
     if not is_loopback(options.host):
         secured = options.tls_client_ca is not None
         encrypted = "" if options.tls_cert else " Nothing is encrypted (see --tls-cert)."
-        others = "clients with a certificate of that authority" if secured else "all who reach it"
+        audience = "clients with a certificate of that authority" if secured else "all who reach it"
         print_note(
-            f"note: {options.host} is not for this machine alone: {others} can have images of "
+            f"note: {options.host} is not for this machine alone: {audience} can have images of "
             f"these scenes rendered.{encrypted}"
         )
     scenes = running.store.scene_names

@@ -32,7 +32,7 @@ from recipes.errors import RecipeError
 from recipes.schema import Recipe
 from tools.serve.cameras import available_camera, requested_camera
 from tools.serve.drawing import DrawingThreads, check_format, encode_for
-from tools.serve.errors import RequestEnded, RequestRefused, invalid, shown
+from tools.serve.errors import RequestEnded, RequestRefused, invalid, quote_text
 from tools.serve.lidar import requested_sweep
 from tools.serve.messages import (
     INTERFACE_VERSION,
@@ -171,9 +171,11 @@ class SensorService:
             try:
                 response = self._respond(method, data, call)
             except (RequestRefused, RequestEnded) as error:
-                code, text = error.code, str(error)
+                code = error.code
+                text = str(error)
             except (ClimateGSError, RecipeError) as error:
-                code, text = grpc.StatusCode.FAILED_PRECONDITION, str(error)
+                code = grpc.StatusCode.FAILED_PRECONDITION
+                text = str(error)
             except MemoryError:
                 code = grpc.StatusCode.RESOURCE_EXHAUSTED
                 text = "memory ran out; ask for smaller images, or for fewer at a time"
@@ -279,7 +281,7 @@ class SensorService:
         facts = self._store.facts(request.scene_id)
         camera = requested_camera(request, facts, self._limits.max_pixels)
         size = f"{camera.width}x{camera.height}"
-        call.subjects.append(f"{request.scene_id} {shown(camera.name)} {size}")
+        call.subjects.append(f"{request.scene_id} {quote_text(camera.name)} {size}")
         opened, recipe = stack.enter_context(self._store.borrow(request.scene_id, call.check))
         if request.insert_ego_mask:
             _check_ego_mask(request, opened, camera)
@@ -371,14 +373,14 @@ def _check_ego_mask(request: Any, opened: OpenScene, camera: Camera) -> None:
         if mask_id.camera_logical_id == camera.name:
             return
         raise invalid(
-            f"ego_mask_id names camera {shown(mask_id.camera_logical_id)}, and the image is of "
-            f"camera {shown(camera.name)}"
+            f"ego_mask_id names camera {quote_text(mask_id.camera_logical_id)}, and the image is of "
+            f"camera {quote_text(camera.name)}"
         )
-    known = ", ".join(names) or "no camera"
+    camera_names = ", ".join(names) or "no camera"
     raise RequestRefused(
         grpc.StatusCode.NOT_FOUND,
-        f"scene {facts.name!r} has no mask of camera {shown(mask_id.camera_logical_id)} and rig "
-        f"{shown(mask_id.rig_config_id)}; rig {facts.name!r} has masks of {known} (they are those "
+        f"scene {facts.name!r} has no mask of camera {quote_text(mask_id.camera_logical_id)} and rig "
+        f"{quote_text(mask_id.rig_config_id)}; rig {facts.name!r} has masks of {camera_names} (they are those "
         f"of ego_masks=FOLDER in the scene's URI)",
     )
 
