@@ -230,14 +230,15 @@ class SceneStore:
         if entry is None:
             raise RequestRefused(
                 grpc.StatusCode.NOT_FOUND,
-                f"there is no scene {quote_text(name)}; this server has {_listed(self.scene_names)}",
+                f"there is no scene {quote_text(name)}; this server has "
+                f"{_listed(self.scene_names)}",
             )
         suffixes = [offered.suffix for offered in self._offered]
         if sign + weather not in suffixes:
             raise RequestRefused(
                 grpc.StatusCode.NOT_FOUND,
-                f"scene {name!r} is not offered in the weather {quote_text(sign + weather)}; choose "
-                f"from {_listed([s for s in suffixes if s])}, or name the scene alone",
+                f"scene {name!r} is not offered in the weather {quote_text(sign + weather)}; "
+                f"choose from {_listed([s for s in suffixes if s])}, or name the scene alone",
             )
         return entry, sign + weather
 

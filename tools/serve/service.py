@@ -373,15 +373,15 @@ def _check_ego_mask(request: Any, opened: OpenScene, camera: Camera) -> None:
         if mask_id.camera_logical_id == camera.name:
             return
         raise invalid(
-            f"ego_mask_id names camera {quote_text(mask_id.camera_logical_id)}, and the image is of "
-            f"camera {quote_text(camera.name)}"
+            f"ego_mask_id names camera {quote_text(mask_id.camera_logical_id)}, and the image is "
+            f"of camera {quote_text(camera.name)}"
         )
     camera_names = ", ".join(names) or "no camera"
     raise RequestRefused(
         grpc.StatusCode.NOT_FOUND,
-        f"scene {facts.name!r} has no mask of camera {quote_text(mask_id.camera_logical_id)} and rig "
-        f"{quote_text(mask_id.rig_config_id)}; rig {facts.name!r} has masks of {camera_names} (they are those "
-        f"of ego_masks=FOLDER in the scene's URI)",
+        f"scene {facts.name!r} has no mask of camera {quote_text(mask_id.camera_logical_id)} and "
+        f"rig {quote_text(mask_id.rig_config_id)}; rig {facts.name!r} has masks of {camera_names} "
+        f"(they are those of ego_masks=FOLDER in the scene's URI)",
     )
 
 
