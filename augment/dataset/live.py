@@ -111,13 +111,13 @@ class SceneDataset(Dataset):
         check_photos([self.recipe], scene.name, selection)
         self._items = [(frame, name) for frame, names in selection for name in names]
         precompute_effects(JobContext(scene, [self.recipe], backend=self._backend))
-        self._memo = memo_of(scene).shared()
+        self._memo = memo_of(scene.as_recorded).shared()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore the state; fill the memo of the scene, which is a new object in this process."""
         self.__dict__.update(state)
         self._process = os.getpid()
-        memo_of(self.scene).take_shared(self._memo)
+        memo_of(self.scene.as_recorded).take_shared(self._memo)
 
     def __len__(self) -> int:
         return len(self._items)

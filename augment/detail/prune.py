@@ -107,6 +107,7 @@ def precompute_errors(scene: Scene, max_error: float = math.inf, *, progress: bo
         max_error: largest error that is needed, share of white.
         progress: if True, show a bar on stderr.
     """
+    scene = scene.as_recorded
     if not has_stored_levels(scene.background):
         errors_of(scene, max_error, progress=progress)
         memo_of(scene).put(_ERRORS, _search_of(scene), shared=True)
@@ -127,6 +128,7 @@ def errors_of(
         max_error: largest error that is needed, share of white.
         progress: if True, show a bar on stderr.
     """
+    scene = scene.as_recorded
     search = _search_of(scene)
     num_rounds = min(bisect_left(ROUND_ERRORS, max_error) + 1, len(ROUND_ERRORS))
     with _search_lock:
@@ -144,6 +146,7 @@ def _is_background(part: PosedGaussians, scene: Scene) -> bool:
 
 def _is_near(camera: Camera, scene: Scene) -> bool:
     """Return True if a camera is near a recorded one."""
+    scene = scene.as_recorded
     centres = memo_of(scene).get(("camera centres",), lambda: _centres_of(scene))
     distances_m = np.linalg.norm(centres - camera.centre.numpy(), axis=1)
     return bool(distances_m.min(initial=np.inf) <= MAX_DISTANCE_M)

@@ -228,6 +228,8 @@ def exposed_surface_of(
         OutputError: the folder cannot be written.
     """
 
+    scene = scene.as_recorded
+
     def find_surface() -> ExposedSurface:
         viewing_cameras = all_cameras(scene) if cameras is None else cameras
         key = (
@@ -278,6 +280,7 @@ def share_exposed_surface(
     Arguments and errors are those of `exposed_surface_of`. Other processes of the job take over the
     memo. Where the job has a folder, the memo holds the file instead of the surface.
     """
+    scene = scene.as_recorded
     exposed_surface = exposed_surface_of(
         scene, settings, cameras=cameras, folder=folder, backend=backend, progress=progress
     )

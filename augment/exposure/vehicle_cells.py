@@ -185,6 +185,7 @@ def parked_vehicles(scene: Scene) -> tuple[ParkedVehicle, ...]:
 
     Boxes of some frames are read, spread over the recorded drive. The result is remembered.
     """
+    scene = scene.as_recorded
     return memo_of(scene).get(("parked vehicles",), lambda: _find_parked_vehicles(scene))
 
 

@@ -10,7 +10,6 @@ not depend on how often that happened, nor on the number of workers.
 from __future__ import annotations
 
 import contextlib
-import copy
 import logging
 import threading
 import time
@@ -346,7 +345,7 @@ class _Run:
             open_scene=self._opened_scene,
             labelled=self.index.labelled_frames,
             instances=self.index.instances,
-            memo=memo_of(scene).shared(),
+            memo=memo_of(scene.as_recorded).shared(),
             overwrite=self.job.overwrite,
             workers=self.job.workers,
         )
@@ -401,7 +400,7 @@ class _Run:
         path = self.job.camera_path
         if path is not None and any(recipe.sections() for recipe in recipes):
             # A copy: the caller's scene must not remember data of this path.
-            self.scene = copy.copy(self.scene)
+            self.scene = self.scene.without_memo()
             cameras = [camera for frame in path for camera in frame.cameras.values()]
         with self.times.measure("prepare"):
             folder = self.job.shared_files_dir or self.out_dir / STATE_FOLDER

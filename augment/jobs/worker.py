@@ -469,7 +469,7 @@ class SceneWorker:
         """Render the task's chunks, and wait until their files are written."""
         if self._opened is None:
             self._opened = self._setup.open_scene()
-            memo_of(self._opened[0]).take_shared(self._setup.memo)
+            memo_of(self._opened[0].as_recorded).take_shared(self._setup.memo)
         try:
             with shorten_switch_interval(renders_on_gpu(self._setup.backend)):
                 runner = FrameRunner(self._setup, *self._opened, self._on_outcome)

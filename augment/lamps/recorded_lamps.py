@@ -202,6 +202,7 @@ def vehicle_pixels(scene: Scene, camera: Camera) -> VehiclePixels:
         scene: the scene, with actors and labelled boxes.
         camera: the camera of the photograph.
     """
+    scene = scene.as_recorded  # the photograph shows them there
     boxes: list[tuple[np.ndarray, bool]] = []
     poses = scene.poses_at(camera.timestamp_ns)
     for owner, actor in enumerate(scene.actors, start=1):

@@ -69,6 +69,7 @@ class RoadHeights:
     @staticmethod
     def of_scene(scene: Scene) -> RoadHeights:
         """Return the heights of a scene, remembered as long as the scene lives."""
+        scene = scene.as_recorded
         return memo_of(scene).get(("lamps, road heights",), lambda: _find_heights(scene))
 
 

@@ -87,6 +87,7 @@ def street_lamps(scene: Scene, settings: StreetLampSettings) -> Lamps:
         scene: the scene.
         settings: light and places.
     """
+    scene = scene.as_recorded
     return memo_of(scene).get(("street lamps", settings), lambda: _find_lamps(scene, settings))
 
 

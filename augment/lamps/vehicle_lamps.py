@@ -94,7 +94,7 @@ def _traits_of(scene: Scene, track_id: str, seed: int) -> _Traits:
     """Return the numbers that the hash of a vehicle's name gives, remembered for the scene."""
     name = scene.name
     key = ("lamps, traits of a vehicle", track_id, seed)
-    return memo_of(scene).get(key, lambda: _draw_traits(name, track_id, seed))
+    return memo_of(scene.as_recorded).get(key, lambda: _draw_traits(name, track_id, seed))
 
 
 def _draw_traits(scene_name: str, track_id: str, seed: int) -> _Traits:
@@ -200,6 +200,7 @@ def _parked_lamps(scene: Scene, settings: VehicleLampSettings) -> Lamps:
             parts.append(_place(lamps, pose))
         return Lamps.concatenate(parts)
 
+    scene = scene.as_recorded
     return memo_of(scene).get(("lamps of parked vehicles", settings), find)
 
 
@@ -243,7 +244,7 @@ def _lamps_on_box(
         )
 
     key = ("lamps of a vehicle", vehicle.track_id, vehicle.owner, settings, brakes)
-    return memo_of(scene).get(key, make)
+    return memo_of(scene.as_recorded).get(key, make)
 
 
 def _is_on(
@@ -428,6 +429,7 @@ def _ego_track(scene: Scene) -> Track:
         poses = torch.stack([frames[time_ns].world_from_ego.double() for time_ns in times_ns])
         return Track(torch.tensor(times_ns, dtype=torch.int64), poses, hold_ns=1 << 62)
 
+    scene = scene.as_recorded
     return memo_of(scene).get(("lamps, ego track",), find)
 
 
@@ -462,4 +464,5 @@ def _front_camera_x(scene: Scene) -> float:
                 return float(ego_from_camera[0, 3])
         return _AHEAD_OF_ORIGIN_M - OwnLampSettings().ahead_m
 
+    scene = scene.as_recorded
     return memo_of(scene).get(("lamps, front camera",), find)

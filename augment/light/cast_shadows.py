@@ -214,11 +214,13 @@ def shadows_of(scene: Scene) -> CastShadows | None:
     def find() -> tuple[CastShadows | None]:  # a value that is None would be made again
         return (_find_shadows(scene),)
 
+    scene = scene.as_recorded
     return memo_of(scene).get(_MEMO, find)[0]
 
 
 def precompute_shadows(scene: Scene) -> None:
     """Compute the shadows now, so that a job's processes need not."""
+    scene = scene.as_recorded
     memo_of(scene).put(_MEMO, (shadows_of(scene),), shared=True)
 
 
@@ -588,7 +590,7 @@ def faded_shadows(scene: Scene, transmittance: float) -> FadedShadows | None:
         maps[:, :, :3] = torch.diag_embed(torch.from_numpy(np.vstack([np.ones(3), factors])))
         return maps
 
-    memo = memo_of(scene)
+    memo = memo_of(scene.as_recorded)
     rows = memo.get(("faded shadows",), place)
     return FadedShadows(
         shadows, transmittance, rows, memo.get(("faded shadows", transmittance), scale)

@@ -128,4 +128,4 @@ def added_colors(scene: Scene, camera: Camera) -> AddedColors | None:
     if color_map is not None and torch.equal(color_map.double(), common):
         return None
     numbers = None if color_map is None else tuple(color_map.flatten().tolist())
-    return memo_of(scene).get(("colours that weather adds", numbers), compute)
+    return memo_of(scene.as_recorded).get(("colours that weather adds", numbers), compute)

@@ -83,6 +83,7 @@ class SceneLight:
 
 def find_scene_light(scene: Scene) -> SceneLight:
     """Return the light that the scene shows; it is computed once for each scene object."""
+    scene = scene.as_recorded
     return memo_of(scene).get(("scene light",), lambda: _find_light(scene))
 
 

@@ -102,6 +102,7 @@ def find_sky_gloss(scene: Scene) -> SkyGloss | None:
 
     It is found once for each scene object.
     """
+    scene = scene.as_recorded
     return memo_of(scene).get(("sky gloss",), lambda: (_find_sky_gloss(scene),))[0]
 
 

@@ -39,6 +39,7 @@ def sweep_of(scene: Scene, frame: int) -> np.ndarray | None:
 
     The result is kept in the scene's memo.
     """
+    scene = scene.as_recorded
     return memo_of(scene).get(("sweep", frame), lambda: (_readable_sweep(scene, frame),))[0]
 
 
@@ -88,6 +89,7 @@ def highest_channel_rad(scene: Scene, points: np.ndarray, camera: Camera) -> flo
         points: the returns of the camera's frame, [N, 3].
         camera: the camera.
     """
+    scene = scene.as_recorded
     indices = [frame.index for frame in scene.frames]
     sample = indices[:: max(1, -(-len(indices) // _NUM_TOP_FRAMES))]
     top_rad = memo_of(scene).get(("lidar top",), lambda: (lidar_top_rad(scene, sample),))[0]

@@ -333,6 +333,7 @@ def own_car_mask(scene: Scene, camera: Camera) -> Bool[np.ndarray, "H W"] | None
         scene: the scene, whose frames have the images.
         camera: a camera of the scene, at any scale, or a window of it.
     """
+    scene = scene.as_recorded
     shape = memo_of(scene).get(("own car", camera.name), lambda: _shape_in(scene, camera.name))
     if shape is None:
         return None
@@ -412,6 +413,7 @@ def own_car_in_view(scene: Scene, camera: Camera) -> OwnCar | None:
         return (OwnCar(mask, rows, np.ascontiguousarray(weights[rows])),)
 
     lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    scene = scene.as_recorded
     return memo_of(scene).get(("own car in view", camera.name, *lens), make)[0]
 
 

@@ -166,6 +166,14 @@ def check_base(recipe: Recipe, scene: Scene) -> None:
             f"{request}, which holds no more pixels than were recorded; render.scale must be <= 1, "
             f"got {recipe.render.scale:g}"
         )
+    if scene.moved_instances:
+        number = min(scene.moved_instances)
+        raise SceneError(
+            f"{request}, and the recorded images show the actors of scene {scene.name!r} where "
+            f"they were recorded, but {len(scene.moved_instances)} of them were moved, removed or "
+            f"added (the first is {scene.actors[number - 1].track_id!r}); render it with base: "
+            f"splats"
+        )
     if not any(frame.image_paths for frame in scene.frames):
         raise SceneError(
             f"{request}, but scene {scene.name!r} ({scene.source}) has no recorded images; open "
@@ -194,6 +202,7 @@ def find_recorded(scene: Scene, camera: Camera) -> tuple[Path, Camera]:
                     )
         return dict(images_by_key)
 
+    scene = scene.as_recorded
     images = memo_of(scene).get(("recorded images",), index)
     for path, recorded_camera in images.get((camera.name, camera.timestamp_ns), ()):
         if _is_window(recorded_camera.resized(camera.width, camera.height), camera):

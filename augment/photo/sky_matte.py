@@ -123,7 +123,7 @@ def sky_matte(
             return None
     image = rgb
     key = "sky matte", frame.index, camera.name, camera.width, camera.height, camera.cx, camera.cy
-    packed = memo_of(scene).get(key, lambda: _refine(image, regions))
+    packed = memo_of(scene.as_recorded).get(key, lambda: _refine(image, regions))
     return SkyMatte(*unpack_matte(packed, image))
 
 
@@ -185,6 +185,7 @@ def recorded_frame(scene: Scene, camera: Camera) -> Frame | None:
             if name in frame.cameras
         }
 
+    scene = scene.as_recorded
     frames = memo_of(scene).get(("frames with images",), index)
     frame = frames.get((camera.name, camera.timestamp_ns))
     if frame is None:
@@ -204,6 +205,7 @@ def recorded_sky_regions(scene: Scene, frame: Frame, name: str) -> UInt8[np.ndar
         frame: one of its frames.
         name: name of the camera.
     """
+    scene = scene.as_recorded
     key = "sky regions", frame.index, name
     return memo_of(scene).get(key, lambda: (_find_recorded_regions(scene, frame, name),))[0]
 

@@ -41,7 +41,7 @@ from augment.render.constants import SURFACE_ALPHA
 from augment.render.rasterize import rasterize
 from augment.scene.cameras import Camera, Frame
 from augment.scene.labels import EGO_VEHICLE
-from augment.scene.scene import Scene
+from augment.scene.scene import Scene, Track
 
 # Distance from which a surface before the sky fades in any fog and casts no pane, metres.
 SKY_FROM_M = 200.0
@@ -182,6 +182,7 @@ def source_views(scene: Scene) -> SourceViews:
     For a fitted scene they are those that it was fitted to, as its files say; else all that was
     recorded.
     """
+    scene = scene.as_recorded
     return memo_of(scene).get("source views", lambda: _find_source_views(scene))
 
 
@@ -347,6 +348,10 @@ def trust_mask(scene: Scene, camera: Camera, *, backend: str = AUTO) -> UInt8[np
     _NUM_WITNESSES of the same camera, at least _PARALLAX_M away, that see it. Splats that stand
     where nothing is, fitted to one image, are contradicted by the others.
 
+    Actors that were moved, and copies of actors, are looked for where images recorded them. So the
+    ground that a removed actor always hid, sides that no image shows and actors of other scenes
+    have no trust.
+
     Args:
         scene: the scene; weather does not count. If its views are not known, no pixel is trusted.
         camera: the view, as rendered. In an orthographic camera no pixel is trusted.
@@ -435,7 +440,9 @@ def _measure_trust(scene: Scene, camera: Camera, view: _ClearView, backend: str)
     if view.sky is not None:
         is_open_sky &= ~_erode_border(view.sky.is_solid)
         if view.sky_share >= MIN_SKY_SHARE:
-            is_solid &= ~_find_panes(scene, camera, view)
+            # A moved actor may stand before what the recording shows as sky.
+            is_moved = np.isin(view.owner, list(scene.moved_instances))
+            is_solid &= is_moved | ~_find_panes(scene, camera, view)
     is_fit = np.where(has_surface, is_solid, is_open_sky)
     points = _view_points(camera, view)
     trust = _measure_detail(scene, camera, points, backend)
@@ -499,9 +506,10 @@ def _measure_detail(scene: Scene, camera: Camera, points: _ViewPoints, backend: 
         view_points = _points_in_view(scene, camera, points, remaining, view.camera)
         detail = _detail_of_points(view.camera, view_points, points.density[remaining])
         has_gain = detail > trust[remaining] + _MIN_GAIN
-        if not (
-            camera.timestamp_ns == view.camera.timestamp_ns and _same_pose(view.camera, camera)
-        ):
+        is_same_image = camera.timestamp_ns == view.camera.timestamp_ns and _same_pose(
+            view.camera, camera
+        )
+        if not is_same_image or scene.moved_instances:
             if has_gain.sum() < _MIN_POINTS * len(trust):
                 continue
             has_gain &= ~_find_hidden(
@@ -585,7 +593,7 @@ def _recorded_range(scene: Scene, number: int, view: SourceView) -> _RecordedRan
         highest = cv2.dilate(rgb, square)
         return (_RecordedRange(lowest.astype(np.float32), highest.astype(np.float32)),)
 
-    return memo_of(scene).get(("trust colours", number), make)[0]
+    return memo_of(scene.as_recorded).get(("trust colours", number), make)[0]
 
 
 def _points_in_view(
@@ -625,21 +633,28 @@ def _move_with_actors(
         scene: the scene.
         points: the points.
         owner: instance of each point, 0 for the background.
-        from_ns: time of the points.
-        to_ns: time of the result.
+        from_ns: time of the points, which are where the scene has its actors.
+        to_ns: time of the result, which is where images recorded the actors.
     """
     moved_points = points.copy()
     for instance in np.unique(owner[owner > 0]):
-        track = scene.actors[instance - 1].track
         is_owned = owner == instance
-        pose_before = track.pose_at(from_ns)
-        pose_after = track.pose_at(to_ns)
+        pose_before = scene.actors[instance - 1].track.pose_at(from_ns)
+        pose_after = _recorded_track(scene, int(instance)).pose_at(to_ns)
         if pose_before is None or pose_after is None:
             moved_points[is_owned] = np.nan
             continue
         turn = (pose_after @ torch.linalg.inv(pose_before)).numpy()
         moved_points[is_owned] = points[is_owned] @ turn[:3, :3].T + turn[:3, 3]
     return moved_points
+
+
+def _recorded_track(scene: Scene, instance: int) -> Track:
+    """Return the track on which images recorded an actor, or the one that it is a copy of."""
+    recorded_actors = scene.as_recorded.actors
+    source_id = recorded_actors[instance - 1].copy_of
+    source_tracks = [actor.track for actor in recorded_actors if actor.track_id == source_id]
+    return source_tracks[0] if source_tracks else recorded_actors[instance - 1].track
 
 
 def _project_points(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -695,7 +710,8 @@ def _find_hidden(camera: Camera, local: np.ndarray, depths: np.ndarray) -> np.nd
 
 
 def _depths(scene: Scene, number: int, camera: Camera, backend: str) -> np.ndarray:
-    """Return the farthest z of 3x3 pixels of a view; infinite where there is no surface."""
+    """Return the farthest z of 3x3 pixels of a view, as recorded; infinite without a surface."""
+    scene = scene.as_recorded
 
     def make() -> np.ndarray:
         small = camera.scaled(min(1.0, _DEPTH_WIDTH / camera.width))

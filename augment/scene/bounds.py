@@ -203,16 +203,21 @@ def actor_boxes(scene: Scene) -> Bounds:
         numbered = enumerate(scene.actors, start=1)
         return Bounds.join(bound_gaussians(a.gaussians, n) for n, a in numbered)
 
+    scene = scene.as_recorded
     return memo_of(scene).get(("boxes of actors",), find)
 
 
 def lowest_z_m(scene: Scene) -> float:
     """Return the height that no splat of the scene reaches below at any time, computed once."""
 
+    base = scene.as_recorded
+    lowest_of_background = memo_of(base).get(
+        ("lowest height of the background",), lambda: _lowest(base.background)
+    )
+
     def find() -> float:
-        return min(
-            _lowest(scene.background), *(_lowest_of_actor(a) for a in scene.actors), math.inf
-        )
+        actors = [actor for actor in scene.actors if not actor.track.is_absent]
+        return min(lowest_of_background, *map(_lowest_of_actor, actors), math.inf)
 
     return memo_of(scene).get(("lowest height",), find)
 

@@ -130,17 +130,39 @@ def evidence_of(scene: Scene, frame: int) -> Evidence | None:
             return None
         if sweep is None:
             return None
-        returns = SortedPoints.from_points(
-            sweep.points_m - np.asarray(scene.world_origin_m, np.float64)
-        )
+        points_m = sweep.points_m - np.asarray(scene.world_origin_m, np.float64)
+        points_m = _without_moved(scene, frame, points_m)
+        returns = SortedPoints.from_points(points_m)
         actors = frozenset(actor.track_id for actor in scene.actors)
-        return Evidence(returns, memo.get(("sorted splats",), sort_splats), actors)
+        splats = memo_of(scene.as_recorded).get(("sorted splats",), sort_splats)
+        return Evidence(returns, splats, actors)
 
     def sort_splats() -> SortedPoints:
         return SortedPoints.from_points(scene.background.means.detach().cpu().numpy())
 
     memo = memo_of(scene)
     return memo.get(("evidence of boxes",), LatestValue).get(frame, read)
+
+
+def _without_moved(
+    scene: Scene, frame: int, points_m: Float[np.ndarray, "N 3"]
+) -> Float[np.ndarray, "M 3"]:
+    """Return the returns of a sweep without those in boxes of moved actors, there and here.
+
+    The sweep shows these actors where they were recorded, and other things where they are.
+    """
+    if not scene.moved_instances:
+        return points_m
+    moved_ids = {scene.actors[number - 1].track_id for number in scene.moved_instances}
+    is_free = np.ones(len(points_m), bool)
+    for labels in (scene.as_recorded.boxes(frame), scene.boxes(frame)):
+        boxes = WorldBoxes.from_labels(labels, scene.world_origin_m)
+        for number, track_id in enumerate(labels.track_ids):
+            if track_id in moved_ids and boxes.is_usable[number]:
+                low_m = boxes.low_m[number]
+                high_m = boxes.high_m[number]
+                is_free &= ~_are_inside(points_m, boxes, number, low_m, high_m)
+    return points_m[is_free]
 
 
 @dataclass(frozen=True, eq=False)

@@ -581,6 +581,7 @@ class Instances:
 
 def instances_of(scene: Scene) -> Instances:
     """Return the numbers of the scene's objects, remembered as long as the scene lives."""
+    scene = scene.as_recorded  # a moved actor keeps its number
     actors = tuple(actor.track_id for actor in scene.actors)
     frames = tuple(sorted(frame.index for frame in scene.frames))
     return memo_of(scene).get(("instances",), lambda: Instances(actors, frames, scene.labels))

@@ -392,6 +392,7 @@ def ground_of(scene: Scene) -> Ground:
         logger.info("%s: %s", scene.name, describe_ground(ground))
         return ground
 
+    scene = scene.as_recorded
     return memo_of(scene).get(("ground",), find)
 
 

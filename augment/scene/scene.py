@@ -34,6 +34,8 @@ from augment.scene.sky import Sky
 
 # Angle below which sin loses its digits; the straight line is exact there.
 _STRAIGHT_RAD = 1e-6
+# Time of the sample of a track that exists at no time: 73 years before 1970, ns.
+_NEVER_NS = -(1 << 61)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +52,17 @@ class Track:
     slightly different moments.)"""
     max_gap_ns: int | None = None
     """Longest time between two samples that is interpolated; None interpolates all."""
+
+    @staticmethod
+    def absent() -> Track:
+        """Return the track of an actor that exists at no time."""
+        times_ns = torch.tensor([_NEVER_NS], dtype=torch.int64)
+        return Track(times_ns, torch.eye(4, dtype=torch.float64)[None], hold_ns=0)
+
+    @property
+    def is_absent(self) -> bool:
+        """Return True for a track of `absent`."""
+        return len(self.timestamps_ns) == 1 and int(self.timestamps_ns[0]) == _NEVER_NS
 
     def __post_init__(self) -> None:
         count = self.timestamps_ns.shape[0]
@@ -404,6 +417,9 @@ class Actor:
     colors_in_world: bool = False
     """If True, SH are for directions of the world, however the actor is turned, as Street Gaussians
     and drivestudio train them; else for directions of its own frame."""
+    copy_of: str | None = None
+    """Track id of the actor of the same scene that this one is a copy of; None for an actor that
+    was recorded, or that comes from another scene."""
 
     def __post_init__(self) -> None:
         waves = self.color_waves
@@ -567,6 +583,10 @@ class Scene:
     """Pixels of recorded images that show the recording car, by camera name, bool [H, W] at the
     size of the camera's images. A camera without a mask shows none of it; None where no masks are
     stated, and the images have to tell."""
+    recorded: Scene | None = None
+    """The scene as it was recorded, where `augment.scene.moved_actors` has moved, removed or added
+    actors: the same actors in the same order, on their recorded tracks. None where nothing was
+    moved."""
 
     def __post_init__(self) -> None:
         for name, color_map in self.color_maps.items():
@@ -586,6 +606,35 @@ class Scene:
     def camera_names(self) -> tuple[str, ...]:
         """Return the names of all cameras, in the order in which they first appear."""
         return tuple(dict.fromkeys(name for frame in self.frames for name in frame.cameras))
+
+    @property
+    def as_recorded(self) -> Scene:
+        """Return the scene as it was recorded; the scene itself where no actor was moved.
+
+        All that does not depend on the places of actors is computed for this scene, so that it is
+        computed once for any number of moves. A scene whose background or sky was replaced after
+        the move is taken as it is.
+        """
+        base = self.recorded
+        if base is None or base.background is not self.background or base.sky is not self.sky:
+            return self
+        return base
+
+    def without_memo(self) -> Scene:
+        """Return the same scene as an object of its own, of which nothing has been computed yet."""
+        base = None if self.recorded is None else replace(self.recorded)
+        return replace(self, recorded=base)
+
+    @property
+    def moved_instances(self) -> frozenset[int]:
+        """Return the instance ids of actors that were moved, removed or added."""
+        recorded_actors = () if self.recorded is None else self.recorded.actors
+        pairs = zip(self.actors, recorded_actors, strict=False)
+        return frozenset(
+            number
+            for number, (actor, recorded) in enumerate(pairs, start=1)
+            if actor.track is not recorded.track
+        )
 
     @property
     def all_gaussians(self) -> tuple[Gaussians, ...]:

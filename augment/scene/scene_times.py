@@ -14,6 +14,7 @@ def scene_times(scene: Scene) -> SceneTimes:
 
     All images count, whatever a job selects: so an image has the same weather in every job.
     """
+    scene = scene.as_recorded
     return memo_of(scene).get("scene times", lambda: _find_times(scene))
 
 

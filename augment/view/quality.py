@@ -7,7 +7,6 @@ open scene. Out: the recipe with settings in numbers. `render_job`, `generate` a
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import json
 import logging
@@ -441,7 +440,7 @@ def resolve_quality(
     if camera_path is not None:
         cameras = [camera for frame in camera_path for camera in frame.cameras.values()]
     # A copy keeps the shared data of settings that are not chosen.
-    trial_scene = copy.copy(scene)
+    trial_scene = scene.without_memo()
     values_of_knob = _allowed_values(recipe)
     bar = ProgressBar(
         unit="picture", desc=f"choosing settings of {recipe.name}", disable=not progress
@@ -471,7 +470,7 @@ def resolve_quality(
     chosen_recipe = apply_settings(recipe, settings)
     if cameras is None and renderer is None:  # keep the images' shared data
         precompute_effects(JobContext(trial_scene, [chosen_recipe], backend=backend))
-        memo_of(scene).take_shared(memo_of(trial_scene).shared())
+        memo_of(scene.as_recorded).take_shared(memo_of(trial_scene.as_recorded).shared())
     is_met = ms is None or ms <= (quality.budget_ms or 0)
     if not is_met:
         _log.warning(

@@ -55,6 +55,7 @@ def weathered_sweep(
                 f"the sweep of frame {frame_index} has a column {name!r} already: it is weathered, "
                 f"or the dataset's own column must be renamed"
             )
+    scene = scene.as_recorded  # the sweep shows actors where they were recorded
     recipe, plan = plan_at(recipe, scene, scene.frame(frame_index).timestamp_ns)
     origins = find_beam_origins(scene, frame_index, sweep)
     echoes = Echoes.from_sweep(sweep, origins, np.asarray(scene.world_origin_m), model)

@@ -152,6 +152,7 @@ def glow_of(scene: Scene) -> Glow:
         slope = 1.5 * (light[:, :, None] * directions[:, None]).mean(0)
         return Glow(light[is_above & (z < _HORIZON_SINE)].mean(0), light.mean(0), slope)
 
+    scene = scene.as_recorded
     return memo_of(scene).get(("light of precipitation",), compute)
 
 

@@ -62,6 +62,7 @@ def paths_of(scene: Scene) -> Mapping[str, Path]:
             for name, camera_poses in poses.items()
         }
 
+    scene = scene.as_recorded
     return memo_of(scene).get(("camera paths",), collect)
 
 

@@ -89,7 +89,8 @@ class FloodEffect(Effect):
         """Precompute the height of the road."""
         if any(self.section_of(recipe) is not None for recipe in context.recipes):
             with suppress(SceneError):  # every image reports the error itself
-                memo_of(context.scene).put(("ground",), ground_of(context.scene), shared=True)
+                scene = context.scene.as_recorded
+                memo_of(scene).put(("ground",), ground_of(scene), shared=True)
 
     def plan_in_scene(
         self, recipe: Recipe, scene: Scene, later_plans: Mapping[str, EffectPlan]

@@ -49,6 +49,7 @@ def exposure_of(plan: LightPlan, scene: Scene) -> Exposure:
     light = plan.light
     if light.exposure == "fixed":
         return fixed_exposure(light)
+    scene = scene.as_recorded
     key = ("lamps, exposure", light, plan.has_street_lamps, plan.own_beam)
     key = (*key, plan.extinction_per_m, plan.wetness, plan.snow_cover)
     return memo_of(scene).get(key, lambda: auto_exposure(light, metered_luminance(plan, scene)))
@@ -57,6 +58,7 @@ def exposure_of(plan: LightPlan, scene: Scene) -> Exposure:
 def white_balance_of(plan: LightPlan, scene: Scene) -> Float64[np.ndarray, "3"]:
     """Return the factors of the channels for all cameras at all times."""
     light = plan.light
+    scene = scene.as_recorded
     key = ("lamps, white balance", light, plan.has_street_lamps, plan.own_beam)
     return memo_of(scene).get(
         key, lambda: white_balance(_road_color(plan, scene), light.white_balance)
@@ -112,6 +114,7 @@ def road_luminance(plan: LightPlan, scene: Scene) -> float:
 
     It has the light of sky and moon, of lamps that do not move, and of the car's own beams.
     """
+    scene = scene.as_recorded
     key = ("lamps, luminance of the road", plan.light, plan.hour, plan.has_street_lamps)
     key = (*key, plan.own_beam)
     return memo_of(scene).get(key, lambda: _find_road_luminance(plan, scene))

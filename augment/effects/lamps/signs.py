@@ -34,7 +34,7 @@ def has_signs(scene: Scene) -> bool:
     classes = scene.background.semantic
     if classes is None:
         return False
-    return memo_of(scene).get(
+    return memo_of(scene.as_recorded).get(
         ("lamps, signs",), lambda: bool((classes == SemanticClass.SIGN).any())
     )
 

@@ -101,6 +101,7 @@ def lamps_at(plan: LightPlan, scene: Scene, camera: Camera) -> Lamps:
 def fixed_lamps(plan: LightPlan, scene: Scene) -> Lamps:
     """Return street lamps and the recipe's list, which are the same at every moment."""
     light = plan.light
+    scene = scene.as_recorded
     key = ("lamps, fixed", light, plan.has_street_lamps)
     return memo_of(scene).get(key, lambda: _make_fixed(plan, scene))
 

@@ -122,7 +122,8 @@ def _run(
     larger = np.clip((radii_m - RUNS_FROM_M) / 1e-3, 0, _MAX_RUN) * (0.5 + units[:, 6])
     rotation = camera.camera_from_world[:3, :3].numpy()
     down = -rotation[:2, 2] if scene.has_known_gravity else np.array([0.0, 1.0])
-    odometer = memo_of(scene).get(("odometer",), lambda: Odometer.of(scene))
+    recorded = scene.as_recorded
+    odometer = memo_of(recorded).get(("odometer",), lambda: Odometer.of(recorded))
     ahead = rotation @ odometer.ahead_at(camera.timestamp_ns)
     # The glass turns air along the axis upwards, as a windscreen does.
     air = np.array([-ahead[0], -ahead[1] - abs(ahead[2])])

@@ -360,8 +360,10 @@ def build_snow_layers(
     Raises:
         SceneError: this scene cannot have snow, or not with cells this small.
     """
-    exposed_surface = _exposed_surface(scene, recipe_snow, backend)
+    light = None if light is scene or light is None else light.as_recorded
+    scene = scene.as_recorded
     light = None if light is scene else light
+    exposed_surface = _exposed_surface(scene, recipe_snow, backend)
 
     def build_layers() -> SnowLayers:
         return lay_snow(
@@ -384,8 +386,10 @@ def build_changing_layers(
     The arguments and errors are those of `build_snow_layers`.
     """
     plan = laid_plan(recipe_snow)
-    exposed_surface = _exposed_surface(scene, plan, backend)
+    light = None if light is scene or light is None else light.as_recorded
+    scene = scene.as_recorded
     light = None if light is scene else light
+    exposed_surface = _exposed_surface(scene, plan, backend)
 
     def build_layers() -> ChangingLayers:
         illumination = find_snow_light(light or scene, plan.snow)

@@ -294,6 +294,7 @@ def _sheen_of(scene: Scene) -> Sheen:
             dark.numpy(), to_display(values).numpy(), _mirrored_light(scene, light), np.array(_FILM)
         )
 
+    scene = scene.as_recorded
     return memo_of(scene).get(("sheen of wet tracks",), compute)
 
 

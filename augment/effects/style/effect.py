@@ -120,8 +120,9 @@ class StyleEffect(Effect):
         """Precompute the maps, so that other processes render no content and read no files."""
         styles = (self.section_of(recipe) for recipe in context.recipes)
         for style in dict.fromkeys(s for s in styles if s and s.has_effect):
-            maps = style_maps(context.scene, style, cameras=context.cameras)
-            memo = memo_of(context.scene)
+            scene = context.scene.as_recorded
+            maps = style_maps(scene, style, cameras=context.cameras)
+            memo = memo_of(scene)
             memo.put(("style maps", style), PackedMaps.of(maps), shared=True)
             memo.put(("style maps", style), maps)
 

@@ -411,6 +411,7 @@ def scene_style_of(scene: Scene, style: Style) -> SceneStyle:
     Raises:
         StyleError: the style cannot be read.
     """
+    scene = scene.as_recorded
     maps = style_maps(scene, style)
 
     def make_style() -> SceneStyle:

@@ -174,6 +174,7 @@ def wet_ground(scene: Scene, seed: int, *, backend: str = "auto") -> WetGround:
     Raises:
         SceneError: metres or gravity are not known.
     """
+    scene = scene.as_recorded
     with refusing_cell_size():
         cells = exposed_surface_of(scene, EXPOSURE_SETTINGS, backend=backend).ground
     key = ("wet ground", seed)
