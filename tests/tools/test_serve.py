@@ -33,6 +33,7 @@ from recipes.schema import Recipe
 from tests.streets import LABELLED_STREET
 from tests.tools.serve_requests import EMPTY, changed, image_request, refusal
 from tools.cli import ServeOptions
+from tools.serve.actors import requested_scene
 from tools.serve.messages import (
     DESCRIPTOR_FILE,
     MAX_MESSAGE_BYTES,
@@ -50,6 +51,7 @@ from tools.serve.server import RunningService, served_recipes, start_service
 
 MAX_REQUESTS = 4
 MAX_PIXELS = 200_000
+NAN = float("nan")
 # Rows of the images below which the test's mask shows the recording car.
 CAR_ROW = 80
 
@@ -316,6 +318,73 @@ def test_the_recording_car_is_put_in_front_where_a_mask_is_asked_for(server):
     assert code == "NOT_FOUND" and "'street' has masks of front" in text
 
 
+# ---- Moving objects ------------------------------------------------------------------------------
+
+
+def with_objects(server: Server, request: Any, shifts: dict[str, float]) -> Any:
+    """The request with actors at their recorded poses, each moved along z by some metres."""
+    request = changed(request)
+    actors = {actor.track_id: actor for actor in server.scene.actors}
+    for name, shift_m in shifts.items():
+        pose = torch.eye(4, dtype=torch.float64)
+        if name in actors:
+            pose = actors[name].track.pose_at(1000 * request.frame_start_us).clone()
+        pose[2, 3] += shift_m
+        message = pose_message(pose)
+        pair = {"start_pose": message, "end_pose": message}
+        request.dynamic_objects.add(track_id=name, pose_pair=pair)
+    return request
+
+
+def test_moving_objects_are_where_the_request_says(server):
+    request = image_request("street@clear", server.camera())
+    names = [actor.track_id for actor in server.scene.actors]
+    assert len(names) == 2  # a car ahead and a pedestrian
+    images = {
+        kind: decode_image(server.stub.render_rgb(r).image_bytes).astype(int)
+        for kind, r in {
+            "recorded": request,
+            "stated": with_objects(server, request, dict.fromkeys(names, 0.0)),
+            "raised": with_objects(server, request, dict.fromkeys(names, 30.0)),
+            "absent": with_objects(server, request, {"somebody else": 0.0}),
+        }.items()
+    }
+    # Float32 poses move splats by less than a thousandth of a pixel.
+    assert np.abs(images["stated"] - images["recorded"]).max() <= 2
+    difference = np.abs(images["absent"] - images["recorded"]).max(-1)
+    assert 20 < (difference > 20).sum() < 2000  # the actors' own pixels
+    # Thirty metres above the road they are out of view.
+    assert np.array_equal(images["raised"], images["absent"])
+
+
+def test_objects_that_the_scene_does_not_have_are_left_out(server):
+    """A simulator states all its traffic, and one error would end its run."""
+    name = server.scene.actors[0].track_id
+    request = image_request("street@clear", server.camera())
+    request = with_objects(server, request, {name: 0.0, "traffic-7": 0.0})
+    requested = requested_scene(request, server.scene)
+    assert requested.unknown_tracks == ("traffic-7",)
+    assert len(requested.scene.actors) == len(server.scene.actors)
+    assert refusal(server.stub.render_rgb, request) == ("OK", "")
+
+
+def test_wrong_objects_are_refused_in_words(server):
+    name = server.scene.actors[0].track_id
+    request = image_request("street", server.camera())
+    twice = with_objects(server, request, {name: 0.0})
+    twice.dynamic_objects.append(twice.dynamic_objects[0])
+    nan = with_objects(server, request, {name: NAN})
+    no_pose = changed(request)
+    no_pose.dynamic_objects.add(track_id=name)
+    for bad_request, words in (
+        (twice, "is there twice"),
+        (nan, "dynamic_objects[0].pose_pair.start_pose: all numbers must be finite"),
+        (no_pose, "dynamic_objects[0].pose_pair is missing"),
+    ):
+        code, text = refusal(server.stub.render_rgb, bad_request)
+        assert code == "INVALID_ARGUMENT" and words in text
+
+
 # ---- LiDAR ---------------------------------------------------------------------------------------
 
 
@@ -374,7 +443,6 @@ def test_one_request_may_have_images_and_sweeps(server):
 
 # ---- Refusals, and clients that misbehave --------------------------------------------------------
 
-NAN = float("nan")
 # What is changed in a good request, and the status and words that it is refused with.
 REFUSED = [
     ({"scene_id": "nowhere"}, "NOT_FOUND", "this server has street"),

@@ -12,7 +12,7 @@ import math
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -30,6 +30,7 @@ from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
 from recipes.errors import RecipeError
 from recipes.schema import Recipe
+from tools.serve.actors import RequestedScene, requested_scene
 from tools.serve.cameras import available_camera, requested_camera
 from tools.serve.drawing import DrawingThreads, check_format, encode_for
 from tools.serve.errors import RequestEnded, RequestRefused, invalid, quote_text
@@ -69,6 +70,8 @@ class Call:
         self._context = context
         self.subjects: list[str] = []
         """Scenes and cameras that the request names, for the log."""
+        self.moved_scenes: dict[tuple[str, bytes], RequestedScene] = {}
+        """Scenes by name and moving objects: images of one step have the same."""
 
     def check(self) -> None:
         """Raise RequestEnded if nobody waits for the response any more."""
@@ -133,6 +136,8 @@ class SensorService:
         self._limits = limits
         self._metrics = metrics
         self._log = log
+        self._noting = threading.Lock()
+        self._noted_scenes: set[str] = set()
         self._places = threading.BoundedSemaphore(limits.max_requests)
         self._answers: dict[str, Callable[[Any, Call], Any]] = {
             "render_rgb": self._render_rgb,
@@ -285,8 +290,40 @@ class SensorService:
         opened, recipe = stack.enter_context(self._store.borrow(request.scene_id, call.check))
         if request.insert_ego_mask:
             _check_ego_mask(request, opened, camera)
-        finish = self._threads.begin_view(opened.scene, camera, recipe, opened.backend, call.check)
+        scene = self._moved_scene(request, opened, call)
+        finish = self._threads.begin_view(scene, camera, recipe, opened.backend, call.check)
         return _PendingImage(request, opened, recipe, camera, finish)
+
+    def _moved_scene(self, request: Any, opened: OpenScene, call: Call) -> Scene:
+        """Return the scene with its actors where the request says."""
+        if not request.dynamic_objects:
+            return opened.scene
+        key_message = message_class("RGBRenderRequest")(
+            frame_start_us=request.frame_start_us,
+            frame_end_us=request.frame_end_us,
+            dynamic_objects=request.dynamic_objects,
+        )
+        key = (opened.name, key_message.SerializeToString(deterministic=True))
+        moved = call.moved_scenes.get(key)
+        if moved is None:
+            moved = call.moved_scenes[key] = requested_scene(request, opened.scene)
+            self._note_unknown_tracks(opened.name, moved.unknown_tracks)
+        return moved.scene
+
+    def _note_unknown_tracks(self, scene_name: str, track_ids: Sequence[str]) -> None:
+        """Warn of tracks that a scene does not have, once for each scene."""
+        with self._noting:
+            if not track_ids or scene_name in self._noted_scenes:
+                return
+            self._noted_scenes.add(scene_name)
+        listed = ", ".join(quote_text(track_id) for track_id in track_ids[:8])
+        _LOG.warning(
+            "scene %s does not have %d of the moving objects of a request, such as %s: they are "
+            "left out, here and in later requests",
+            scene_name,
+            len(track_ids),
+            listed,
+        )
 
     def _finish_image(self, pending: _PendingImage) -> Any:
         """Return the `RGBRenderReturn` of an image that was begun."""
