@@ -43,9 +43,20 @@ class Metrics:
         self._changing = threading.Lock()
         self._figures_by_method: dict[str, _MethodFigures] = {}
         self._num_images = 0
+        self._num_in_flight = 0
         self._start_s = time.monotonic()
 
-    def add(self, method: str, status: str, seconds: float) -> None:
+    @property
+    def num_in_flight(self) -> int:
+        """Number of requests that have begun and not ended."""
+        return self._num_in_flight
+
+    def begin(self) -> None:
+        """Count a request that begins."""
+        with self._changing:
+            self._num_in_flight += 1
+
+    def end(self, method: str, status: str, seconds: float) -> None:
         """Count a request that has ended.
 
         Args:
@@ -54,6 +65,7 @@ class Metrics:
             seconds: time from its arrival to its end.
         """
         with self._changing:
+            self._num_in_flight -= 1
             figures = self._figures_by_method.setdefault(method, _MethodFigures())
             figures.add(status, 1000 * seconds)
 

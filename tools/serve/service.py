@@ -169,6 +169,7 @@ class SensorService:
 
         def handle(data: bytes, context: Any) -> bytes:
             start_s = time.perf_counter()
+            self._metrics.begin()
             call = Call(context)
             code = grpc.StatusCode.OK
             text = ""
@@ -189,7 +190,7 @@ class SensorService:
                 text = f"a defect of the server, whose log says more: {type(error).__name__}"
                 _LOG.error("%s", "".join(traceback.format_exception(error)))
             seconds = time.perf_counter() - start_s
-            self._metrics.add(method.name, code.name, seconds)
+            self._metrics.end(method.name, code.name, seconds)
             if self._log is not None:
                 self._log(_log_line(context, method, call, code, text, seconds))
             if code is not grpc.StatusCode.OK:
