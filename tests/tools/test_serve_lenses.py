@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -134,3 +137,18 @@ def test_read_outs_are_those_of_the_shutter():
     assert read_out(spec) == "right_to_left"
     spec.shutter_type = 77
     assert read_out(spec) is None
+
+
+def test_threads_that_ask_first_get_the_same_classes():
+    code = """
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+from tools.serve.messages import message_class
+barrier = Barrier(8)
+def ask(_):
+    barrier.wait()
+    return message_class("CameraSpec")
+with ThreadPoolExecutor(8) as pool:
+    assert len(set(pool.map(ask, range(8)))) == 1
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])

@@ -11,6 +11,7 @@ uses the classes of the first.
 
 from __future__ import annotations
 
+import threading
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,6 +33,8 @@ SERVICE = "SensorsimService"
 INTERFACE_VERSION = (0, 54, 0)
 # Bytes of a message, at most, as of AlpaSim's client.
 MAX_MESSAGE_BYTES = 64 << 20
+# Held while the pool is built, which several threads may be the first to ask for.
+_building = threading.Lock()
 
 
 class Method(NamedTuple):
@@ -45,9 +48,18 @@ class Method(NamedTuple):
     """Class of its response."""
 
 
-@cache
 def descriptor_pool() -> DescriptorPool:
-    """Return a pool with the files of both packages."""
+    """Return the pool with the files of both packages.
+
+    There is one pool: messages of two pools are of different classes.
+    """
+    with _building:
+        return _build_pool()
+
+
+@cache
+def _build_pool() -> DescriptorPool:
+    """Return a new pool with the files of both packages."""
     files = descriptor_pb2.FileDescriptorSet.FromString(DESCRIPTOR_FILE.read_bytes())
     pool = DescriptorPool()
     for file in files.file:
