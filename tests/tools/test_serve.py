@@ -502,6 +502,22 @@ def test_a_request_without_lens_or_pose_is_refused_in_words(server):
     assert "sensor_pose is missing" in refusal(server.stub.render_rgb, request)[1]
 
 
+def test_a_lens_of_senseless_numbers_is_refused_in_words(server):
+    """Pixels at this lens's end see so little that pinhole views would need 30 times its pixels."""
+    request = image_request("street", server.camera().scaled(3.0))
+    param = request.camera_intrinsics.ftheta_param
+    param.principal_point_x = 240.0
+    param.principal_point_y = 144.0
+    param.reference_poly = 2
+    param.angle_to_pixeldist_poly.extend([0.0, 110.0, 0.0, 0.0, 0.0, 0.0, 0.0, 5000.0])
+    code, text = refusal(server.stub.render_rgb, request)
+    assert code == "INVALID_ARGUMENT" and "Check the numbers of the lens" in text
+    param.principal_point_x = -4000.0
+    param.max_angle = 0.5
+    code, text = refusal(server.stub.render_rgb, request)
+    assert code == "INVALID_ARGUMENT" and "no pixel of its image" in text
+
+
 def test_a_batch_beyond_its_limits_is_refused(server):
     batch_class = message_class("BatchRGBRenderRequest")
     request = image_request("street", server.camera())

@@ -13,6 +13,7 @@ from augment.output.codecs import encode_image
 from augment.render.backends import renders_on_gpu
 from augment.render.threads import num_concurrent_views, split_threads, wait_for_result
 from augment.scene.cameras import Camera
+from augment.scene.pinhole_views import layout_of
 from augment.scene.scene import Scene
 from augment.timing import watched
 from augment.view.render_view import begin_view
@@ -22,6 +23,11 @@ from tools.serve.errors import invalid, unimplemented
 from tools.serve.messages import enum_numbers
 
 Result = TypeVar("Result")
+# Pixels of the pinhole views that a lens is drawn from, at most, over the pixels of its image. The
+# lenses of cars need up to 4; senseless numbers would need hundreds.
+MAX_VIEW_SHARE = 12
+# Pixels of such views that are always drawn: margins of small images count much.
+MIN_VIEW_PIXELS = 1 << 18
 
 
 class DrawingThreads:
@@ -71,6 +77,8 @@ class DrawingThreads:
 
         def draw() -> WeatheredView | PendingView:
             check()
+            if camera.lens is not None:
+                _check_lens_views(camera)
             with watched(lambda progress: check()):
                 pending = begin_view(scene, camera, recipe, backend=backend)
                 return pending if on_gpu else pending.result()
@@ -88,6 +96,21 @@ class DrawingThreads:
         with self._changing:
             if self._pool is not None:
                 self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _check_lens_views(camera: Camera) -> None:
+    """Refuse a lens that sees nothing, or that takes far more pixels to draw than it shows."""
+    try:
+        views = layout_of(camera).views
+    except ValueError as error:
+        raise invalid(f"camera_intrinsics: {error}") from error
+    num_pixels = sum(view.width * view.height for view in views)
+    if num_pixels > MAX_VIEW_SHARE * camera.width * camera.height + MIN_VIEW_PIXELS:
+        raise invalid(
+            f"camera_intrinsics: this lens would take {num_pixels} pixels to draw an image of "
+            f"{camera.width}x{camera.height}; at most {MAX_VIEW_SHARE} times its pixels are drawn. "
+            f"Check the numbers of the lens"
+        )
 
 
 def check_format(request: Any) -> None:

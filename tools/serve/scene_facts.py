@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from augment.errors import SceneError
 from augment.scene.cameras import Camera, Frame
 from augment.scene.geometry import invert_rigid
 from augment.scene.scene import Scene, Track
@@ -53,8 +54,16 @@ def facts_of(scene: Scene, name: str) -> SceneFacts:
     Args:
         scene: the scene, which has frames.
         name: name for clients.
+
+    Raises:
+        SceneError: the scene has times that messages cannot hold.
     """
     times = scene_times(scene)
+    if min(times.start_ns, scene.frames[0].timestamp_ns) < 0:
+        raise SceneError(
+            f"scene {scene.name!r} ({scene.source}) has times before 0, which the interface of "
+            f"simulators cannot say; it begins at {times.start_ns} ns"
+        )
     rig = _rig_track(scene.frames)
     images = (camera for frame in scene.frames for camera in frame.cameras.values())
     masks = scene.ego_masks or {}

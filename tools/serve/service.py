@@ -391,7 +391,11 @@ def _check_batch(requests: Any) -> None:
         raise invalid(
             f"a request may ask for {MAX_BATCH_IMAGES} images, at most; got {len(requests)}"
         )
-    num_pixels = sum(request.resolution_w * request.resolution_h for request in requests)
+    num_pixels = 0
+    for request in requests:
+        spec = request.camera_intrinsics
+        width = request.resolution_w or spec.resolution_w
+        num_pixels += width * (request.resolution_h or spec.resolution_h)
     if num_pixels > MAX_BATCH_PIXELS:
         raise invalid(
             f"the images of a request may have {MAX_BATCH_PIXELS} pixels together, at most; got "
