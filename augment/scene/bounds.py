@@ -30,8 +30,9 @@ from augment.scene.cameras import Camera
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.scene import Actor, Gaussians, Scene
 
-# Margin around the image, pixels: 1.9 of it is the blur, the rest float32's rounding of pixels.
-_BLUR_PX = 3.0
+# Margin around the image, pixels: 3.7 of it is the largest blur, the rest float32's rounding of
+# pixels.
+_BLUR_PX = 4.0
 # Rounding of a sum, as a part of all its terms: a hundred times float32's.
 _ROUNDING = 1e-5
 

@@ -1,9 +1,8 @@
 """Pinhole views that cover the picture of a camera with a lens, and the way between their pixels.
 
 The rasteriser draws pinholes. A camera with a lens is drawn as one pinhole view, or as several that
-look into different directions, and every pixel of the lens is looked up in them. The layout with
-the fewest pixels is taken, of one view, of sectors side by side, and of the faces of a cube. Each
-view has at least the lens's resolution at every pixel that is looked up in it.
+look into different directions, and every pixel of the lens is looked up in them. Each view has at
+least the lens's resolution at every pixel that is looked up in it.
 
 Views overlap in a narrow band, in which their colours are mixed: so no seam is seen where effects
 differ a little between views.
@@ -13,33 +12,35 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 from scipy.interpolate import RectBivariateSpline
-from torch import Tensor
 
 from augment.scene.cameras import Camera
 from augment.scene.geometry import rigid
 from augment.scene.lenses import Intrinsics, Lens
 
 # Largest angle between a view's axis and a ray that is looked up in it, degrees.
-MAX_OFF_AXIS_DEG = 70.0
+MAX_OFF_AXIS_DEG = 65.0
+# Largest ratio of the areas that pixels of the lens cover in one of several views.
+MAX_AREA_RATIO = 2.2
+# The same of a single view, which costs least. Its splats are blurred as in a pinhole picture.
+MAX_SINGLE_AREA_RATIO = 4.0
 # Width of the band in which two views are mixed: difference of the cosines to both axes.
-BLEND_BAND = 0.04
+BLEND_BAND = 0.03
 # Pixels of a view beyond those that are looked up, on every side.
 MARGIN_PX = 4
-# Pixels of a single view, in those of the lens image, up to which no other layout is tried.
-MAX_SINGLE_SIZE = 2.5
 # Cost of another view, in pixels: every view looks at all splats and effects anew.
-VIEW_COST_PX = 400_000
-# Numbers of sectors that are tried.
-_SECTORS = (2, 3, 4)
+VIEW_COST_PX = 150_000
+# Columns and rows of views that are tried, spread over the lens image.
+_GRIDS = ((2, 1), (1, 2), (3, 1), (2, 2), (3, 2), (2, 3), (3, 3), (4, 3), (3, 4), (4, 4), (5, 5))
+# Largest factor of the splats' blur in a view.
+MAX_BLUR_GAIN = 4.0
 # Spacing of the pixels whose rays are solved, where rays in between can be interpolated, pixels.
 _COARSE_PX = 8
 # Largest error of interpolated rays, pixels.
@@ -66,6 +67,8 @@ class PinholeView:
     """Share of the view in the colour of a pixel of the lens image."""
     distance_per_z: Float32[np.ndarray, "H W"]
     """Distance along the ray for a depth of 1 in the view."""
+    blur_gain: float
+    """Factor of the rasteriser's blur, px^2, by which splats are as wide as in the lens image."""
 
     def camera_for(self, camera: Camera) -> Camera:
         """Return the view as a pinhole camera.
@@ -132,18 +135,9 @@ def _make_layout(
             f"{type(lens).__name__} (up to {math.degrees(lens.max_angle_rad):.4g} degrees from the "
             f"axis); check the lens's numbers and {intrinsics}"
         )
-    best: tuple[float, tuple[PinholeView, ...]] | None = None
-    for rotations in _candidates(rays[is_inside]):
-        views = _views_of(rotations, rays, is_inside, intrinsics)
-        if views is None:
-            continue
-        cost = sum(view.width * view.height + VIEW_COST_PX for view in views)
-        if best is None or cost < best[0]:
-            best = (cost, views)
-        if len(views) == 1 and cost <= MAX_SINGLE_SIZE * width * height + VIEW_COST_PX:
-            break
-    assert best is not None  # the cube covers every direction
-    return LensLayout(best[1], is_inside, rays.astype(np.float32))
+    rotations = _choose_views(rays, is_inside, intrinsics)
+    views = _views_of(rotations, rays, is_inside, intrinsics)
+    return LensLayout(views, is_inside, rays.astype(np.float32))
 
 
 def pixel_rays(
@@ -189,42 +183,118 @@ def _coarse_places(size: int) -> Float64[np.ndarray, " N"]:
     return np.linspace(0.5, size - 0.5, count)
 
 
-def _candidates(rays: Float64[np.ndarray, "N 3"]) -> list[list[Float64[np.ndarray, "3 3"]]]:
-    """Return sets of views that may cover the rays, as rotations from the camera's axes.
+def _choose_views(
+    rays: Float64[np.ndarray, "H W 3"], is_inside: Bool[np.ndarray, "H W"], intrinsics: Intrinsics
+) -> list[Float64[np.ndarray, "3 3"]]:
+    """Return the views with the fewest pixels, as rotations from the camera's axes.
+
+    One view is taken if it stretches no part of the lens image much more than another. Splats are
+    blurred by pixels of the view: where these are much smaller than the lens's, they are too sharp.
 
     Args:
-        rays: unit directions in the camera's axes.
+        rays: unit directions of the pixels in the camera's axes.
+        is_inside: pixels that see something.
+        intrinsics: of the lens image.
     """
-    sets = [[np.eye(3)]]
-    azimuth = np.arctan2(rays[:, 0], rays[:, 2])
-    low = float(azimuth.min())
-    span = float(azimuth.max()) - low
-    for count in _SECTORS:
-        sets.append([_turned_right(low + span * (i + 0.5) / count) for i in range(count)])
-    quarter = math.pi / 2
-    cube = [_turned_right(quarter * i) for i in range(4)]
-    cube += [_turned_down(quarter), _turned_down(-quarter)]
-    # Four views about the axis: corners of a wide lens lie in their middles.
-    tilt = math.radians(40.0)
-    around = [
-        _turned_down(down) @ _turned_right(right)
-        for right, down in itertools.product((-tilt, tilt), repeat=2)
-    ]
-    return [*sets, around, cube]
+    step = max(1, min(rays.shape[:2]) // 64)
+    coarse_rays = rays[::step, ::step]
+    coarse_inside = is_inside[::step, ::step]
+    single = [np.eye(3)]
+    ratio, _ = _judge(single, coarse_rays, coarse_inside, intrinsics, step)
+    if ratio <= MAX_SINGLE_AREA_RATIO:
+        return single
+    choices = []
+    for columns, rows in _GRIDS:
+        rotations = _spread_views(coarse_rays, coarse_inside, columns, rows)
+        ratio, cost = _judge(rotations, coarse_rays, coarse_inside, intrinsics, step)
+        choices.append((max(ratio, MAX_AREA_RATIO), cost, rotations))
+    return min(choices, key=lambda choice: choice[:2])[2]
 
 
-def _turned_right(angle_rad: float) -> Float64[np.ndarray, "3 3"]:
-    """Return the rotation from the camera's axes to those of a view turned to the right."""
-    cosine = math.cos(angle_rad)
-    sine = math.sin(angle_rad)
-    return np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
+def _spread_views(
+    rays: Float64[np.ndarray, "H W 3"], is_inside: Bool[np.ndarray, "H W"], columns: int, rows: int
+) -> list[Float64[np.ndarray, "3 3"]]:
+    """Return views that look at the middles of a grid's cells over the lens image.
+
+    Args:
+        rays: unit directions of the pixels in the camera's axes.
+        is_inside: pixels that see something.
+        columns: columns of the grid.
+        rows: rows of the grid.
+    """
+    height, width = is_inside.shape
+    rotations = []
+    for row in range(rows):
+        for column in range(columns):
+            cell = np.s_[
+                row * height // rows : (row + 1) * height // rows,
+                column * width // columns : (column + 1) * width // columns,
+            ]
+            inside = is_inside[cell]
+            if inside.any():
+                rotations.append(_looking_along(rays[cell][inside].mean(0)))
+    return rotations
 
 
-def _turned_down(angle_rad: float) -> Float64[np.ndarray, "3 3"]:
-    """Return the rotation from the camera's axes to those of a view turned down."""
-    cosine = math.cos(angle_rad)
-    sine = math.sin(angle_rad)
-    return np.array([[1.0, 0.0, 0.0], [0.0, cosine, -sine], [0.0, sine, cosine]])
+def _looking_along(direction: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
+    """Return the smallest rotation from the camera's axes that brings a direction to the axis."""
+    x, y, z = direction / np.linalg.norm(direction)
+    if z < -0.999:
+        return np.diag([-1.0, 1.0, -1.0])
+    k = 1 / (1 + z)
+    return np.array([[1 - k * x * x, -k * x * y, -x], [-k * x * y, 1 - k * y * y, -y], [x, y, z]])
+
+
+def _judge(
+    rotations: Sequence[Float64[np.ndarray, "3 3"]],
+    rays: Float64[np.ndarray, "H W 3"],
+    is_inside: Bool[np.ndarray, "H W"],
+    intrinsics: Intrinsics,
+    step: int,
+) -> tuple[float, float]:
+    """Return the largest ratio of stretches in a view, and the cost of a set of views in pixels.
+
+    Args:
+        rotations: from the camera's axes to the views'.
+        rays: unit directions of some pixels in the camera's axes.
+        is_inside: pixels that see something.
+        intrinsics: of the lens image.
+        step: spacing of these pixels.
+    """
+    weights = _weights(rotations, rays, is_inside)
+    if ((weights.sum(0) <= 0) & is_inside).any():
+        return math.inf, math.inf
+    largest = 1.0
+    cost = 0.0
+    for rotation, weight in zip(rotations, weights, strict=True):
+        is_used = weight > 0
+        if not is_used.any():
+            continue
+        across, down = _flat_places(rotation, rays, is_used, intrinsics)
+        smallest, areas = _stretches(across / step, down / step, is_used)
+        if len(areas):
+            largest = max(largest, float(np.quantile(areas, 0.99) / np.quantile(areas, 0.01)))
+        size = np.ptp(across[is_used]) * np.ptp(down[is_used])
+        cost += float(size) / smallest**2 + VIEW_COST_PX
+    return largest, cost
+
+
+def _weights(
+    rotations: Sequence[Float64[np.ndarray, "3 3"]],
+    rays: Float64[np.ndarray, "H W 3"],
+    is_inside: Bool[np.ndarray, "H W"],
+) -> Float64[np.ndarray, "V H W"]:
+    """Return the share of each view in the pixels of the lens image; zeros where no view reaches.
+
+    Args:
+        rotations: from the camera's axes to the views'.
+        rays: unit directions of the pixels in the camera's axes.
+        is_inside: pixels that see something.
+    """
+    cosines = np.stack([rays @ rotation[2] for rotation in rotations])
+    weights = np.maximum(cosines - (cosines.max(0) - BLEND_BAND), 0.0) * is_inside
+    weights *= cosines >= math.cos(math.radians(MAX_OFF_AXIS_DEG))
+    return weights / np.maximum(weights.sum(0), 1e-12)
 
 
 def _views_of(
@@ -232,9 +302,8 @@ def _views_of(
     rays: Float64[np.ndarray, "H W 3"],
     is_inside: Bool[np.ndarray, "H W"],
     intrinsics: Intrinsics,
-) -> tuple[PinholeView, ...] | None:
-    """Return the views with these rotations, as small as the rays allow; None if they cannot see
-    every ray.
+) -> tuple[PinholeView, ...]:
+    """Return the views with these rotations, as small as the rays allow.
 
     Args:
         rotations: from the camera's axes to the views'.
@@ -242,30 +311,41 @@ def _views_of(
         is_inside: pixels that see something.
         intrinsics: of the lens image.
     """
-    cosines = np.stack([rays @ rotation[2] for rotation in rotations])
-    largest = cosines.max(0)
-    min_cosine = math.cos(math.radians(MAX_OFF_AXIS_DEG))
-    if (largest[is_inside] < min_cosine).any():
-        return None
-    views = []
-    weights = np.maximum(cosines - (largest - BLEND_BAND), 0.0) * is_inside
-    # A pixel at the edge of a view's reach takes another one.
-    weights = np.where(cosines >= min_cosine * 0.9, weights, 0.0)
-    weights /= np.maximum(weights.sum(0), 1e-12)
-    for rotation, weight, cosine in zip(rotations, weights, cosines, strict=True):
-        is_used = weight > 0
-        if not is_used.any():
-            continue
-        views.append(_view_of(rotation, rays, weight, cosine, intrinsics))
-    return tuple(views)
+    weights = _weights(rotations, rays, is_inside)
+    return tuple(
+        _view_of(rotation, rays, weight, intrinsics, is_single=len(rotations) == 1)
+        for rotation, weight in zip(rotations, weights, strict=True)
+        if (weight > 0).any()
+    )
+
+
+def _flat_places(
+    rotation: Float64[np.ndarray, "3 3"],
+    rays: Float64[np.ndarray, "H W 3"],
+    is_used: Bool[np.ndarray, "H W"],
+    intrinsics: Intrinsics,
+) -> tuple[Float64[np.ndarray, "H W"], Float64[np.ndarray, "H W"]]:
+    """Return x and y of pixels in a view with the lens image's focal lengths, from its axis.
+
+    Args:
+        rotation: from the camera's axes to the view's.
+        rays: unit directions of the pixels in the camera's axes.
+        is_used: pixels that are looked up in the view; the others get 0.
+        intrinsics: of the lens image.
+    """
+    z = np.where(is_used, rays @ rotation[2], 1.0)
+    across = np.where(is_used, rays @ rotation[0] / z, 0.0) * intrinsics.fx
+    down = np.where(is_used, rays @ rotation[1] / z, 0.0) * intrinsics.fy
+    return across, down
 
 
 def _view_of(
     rotation: Float64[np.ndarray, "3 3"],
     rays: Float64[np.ndarray, "H W 3"],
     weight: Float64[np.ndarray, "H W"],
-    cosine: Float64[np.ndarray, "H W"],
     intrinsics: Intrinsics,
+    *,
+    is_single: bool,
 ) -> PinholeView:
     """Return one view, as small as the pixels that are looked up in it allow.
 
@@ -273,16 +353,18 @@ def _view_of(
         rotation: from the camera's axes to the view's.
         rays: unit directions of the pixels in the camera's axes.
         weight: share of the view in each pixel.
-        cosine: of the angle between each ray and the view's axis.
         intrinsics: of the lens image.
+        is_single: True for the only view of a layout.
     """
     is_used = weight > 0
-    z = np.where(is_used, cosine, 1.0)
-    across = np.where(is_used, rays @ rotation[0] / z, 0.0) * intrinsics.fx
-    down = np.where(is_used, rays @ rotation[1] / z, 0.0) * intrinsics.fy
-    scale = 1 / _smallest_stretch(across, down, is_used)
+    across, down = _flat_places(rotation, rays, is_used, intrinsics)
+    smallest, areas = _stretches(across, down, is_used)
+    scale = 1 / smallest
     if abs(scale - 1) < 0.02:
         scale = 1.0
+    blur_gain = scale * scale
+    if not is_single and len(areas):
+        blur_gain *= float(np.median(areas))
     # The view's pixels have the raster of the lens image at the axis: without distortion, no pixel
     # lies between others.
     columns = across * scale + intrinsics.cx
@@ -300,16 +382,18 @@ def _view_of(
         ),
         np.stack([columns - left, rows - top], -1).astype(np.float32),
         weight.astype(np.float32),
-        np.where(is_used, 1 / z, 0.0).astype(np.float32),
+        np.where(is_used, 1 / np.where(is_used, rays @ rotation[2], 1.0), 0.0).astype(np.float32),
+        min(max(blur_gain, 1.0), MAX_BLUR_GAIN),
     )
 
 
-def _smallest_stretch(
+def _stretches(
     across: Float64[np.ndarray, "H W"],
     down: Float64[np.ndarray, "H W"],
     is_used: Bool[np.ndarray, "H W"],
-) -> float:
-    """Return the smallest stretch of a view against the lens image, in any direction.
+) -> tuple[float, Float64[np.ndarray, " N"]]:
+    """Return the smallest stretch of a view against the lens image, in any direction and place, and
+    the areas of the lens's pixels in the view, in its pixels.
 
     Args:
         across: place of each pixel in the view along x, pixels.
@@ -317,20 +401,20 @@ def _smallest_stretch(
         is_used: pixels that are looked up in the view.
     """
     if min(across.shape) < 2:
-        return 1.0
+        return 1.0, np.zeros(0)
     is_whole = is_used[:-1, :-1] & is_used[1:, :-1] & is_used[:-1, 1:]
     if not is_whole.any():
-        return 1.0
+        return 1.0, np.zeros(0)
     xx = np.diff(across, axis=1)[:-1][is_whole]
     xy = np.diff(across, axis=0)[:, :-1][is_whole]
     yx = np.diff(down, axis=1)[:-1][is_whole]
     yy = np.diff(down, axis=0)[:, :-1][is_whole]
     # The smaller singular value of [[xx, xy], [yx, yy]].
     total = xx * xx + xy * xy + yx * yx + yy * yy
-    determinant = xx * yy - xy * yx
-    difference = np.sqrt(np.maximum(total * total - 4 * determinant * determinant, 0.0))
+    areas = xx * yy - xy * yx
+    difference = np.sqrt(np.maximum(total * total - 4 * areas * areas, 0.0))
     smallest = np.sqrt(np.maximum((total - difference) / 2, 0.0))
-    return float(max(np.quantile(smallest, 0.001), 0.05))
+    return float(max(np.quantile(smallest, 0.001), 0.05)), areas
 
 
 def covering_camera(camera: Camera) -> Camera:

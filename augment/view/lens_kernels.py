@@ -78,8 +78,8 @@ def add_view(image, pixels, weights, slack, out):
             _step(pixels, weights, row, column, 1, 0, steps[1])
             size_x = math.sqrt(steps[0, 0] ** 2 + steps[0, 1] ** 2)
             size_y = math.sqrt(steps[1, 0] ** 2 + steps[1, 1] ** 2)
-            num_x = min(max(int(math.ceil(size_x - slack)), 1), MAX_SAMPLES)
-            num_y = min(max(int(math.ceil(size_y - slack)), 1), MAX_SAMPLES)
+            num_x = min(max(math.ceil(size_x - slack), 1), MAX_SAMPLES)
+            num_y = min(max(math.ceil(size_y - slack), 1), MAX_SAMPLES)
             total[:] = np.float32(0.0)
             for j in range(num_y):
                 shift_y = (np.float32(j) + half) / np.float32(num_y) - half
@@ -137,12 +137,12 @@ def look_up_depth(depth, pixels, is_taken, max_spread, out):
                 continue
             u = pixels[row, column, 0]
             v = pixels[row, column, 1]
-            nearest_row = min(max(int(math.floor(v)), 0), view_height - 1)
-            nearest_column = min(max(int(math.floor(u)), 0), view_width - 1)
+            nearest_row = min(max(math.floor(v), 0), view_height - 1)
+            nearest_column = min(max(math.floor(u), 0), view_width - 1)
             nearest = depth[nearest_row, nearest_column]
             out[row, column] = nearest
-            left = int(math.floor(u - half))
-            top = int(math.floor(v - half))
+            left = math.floor(u - half)
+            top = math.floor(v - half)
             if left < 0 or top < 0 or left + 1 >= view_width or top + 1 >= view_height:
                 continue
             low = np.float32(np.inf)

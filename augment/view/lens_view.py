@@ -10,6 +10,7 @@ comes after this: `augment.view.render_view` applies it to the whole picture.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -47,6 +48,10 @@ class ViewPicture:
     """Pixels that see something through the lens; None if all do."""
 
 
+# Function that draws the picture of a pinhole camera, with a factor of the rasteriser's blur.
+DrawPinhole = Callable[[Camera, float], ViewPicture]
+
+
 @dataclass(frozen=True, eq=False)
 class Strip:
     """Rows or columns of an image that are drawn at one pose."""
@@ -57,15 +62,13 @@ class Strip:
     """Rows and columns of the strip in the image."""
 
 
-def draw_through_lens(
-    camera: Camera, num_strips: int, draw: Callable[[Camera], ViewPicture]
-) -> ViewPicture:
+def draw_through_lens(camera: Camera, num_strips: int, draw: DrawPinhole) -> ViewPicture:
     """Return the picture of a camera with a lens, a rolling shutter, or both.
 
     Args:
         camera: the camera.
         num_strips: strips in which a rolling shutter is drawn.
-        draw: draws the picture of a pinhole camera.
+        draw: draws a pinhole view.
     """
     if camera.shutter is None:
         return _draw_lens(camera, draw)
@@ -87,7 +90,7 @@ def strips_of(camera: Camera, num_strips: int) -> tuple[Strip, ...]:
     count = min(max(num_strips, 1), size)
     borders = [round(size * i / count) for i in range(count + 1)]
     strips = []
-    for first, end in zip(borders[:-1], borders[1:], strict=True):
+    for first, end in itertools.pairwise(borders):
         share = shutter.share_at((first + end) / 2, size)
         moment = camera.at_read_out(share)
         if shutter.is_along_rows:
@@ -100,13 +103,13 @@ def strips_of(camera: Camera, num_strips: int) -> tuple[Strip, ...]:
     return tuple(strips)
 
 
-def _draw_lens(camera: Camera, draw: Callable[[Camera], ViewPicture]) -> ViewPicture:
+def _draw_lens(camera: Camera, draw: DrawPinhole) -> ViewPicture:
     """Return the picture of a camera without shutter, through its lens if it has one."""
     if camera.lens is None:
-        return draw(camera)
+        return draw(camera, 1.0)
     with timed("lens: layout"):
         layout = layout_of(camera)
-    pictures = [draw(view.camera_for(camera)) for view in layout.views]
+    pictures = [draw(view.camera_for(camera), view.blur_gain) for view in layout.views]
     with timed("lens"):
         return _merge(layout, pictures, is_along_ray=camera.lens.is_depth_along_ray)
 

@@ -315,8 +315,12 @@ def _render_lens_view(
     """
     drawings = list[_Drawing]()
 
-    def draw(view_camera: Camera) -> ViewPicture:
-        drawing = _draw_scene(scene, view_camera, plan, backend=backend, is_behind_lens=False)
+    def draw(view_camera: Camera, blur_gain: float) -> ViewPicture:
+        blur_px2 = plan.settings.blur_px2 * blur_gain
+        plan_of_view = replace(plan, settings=replace(plan.settings, blur_px2=blur_px2))
+        drawing = _draw_scene(
+            scene, view_camera, plan_of_view, backend=backend, is_behind_lens=False
+        )
         drawings.append(drawing)
         rendered = drawing.rendered
         raster = rendered.raster
