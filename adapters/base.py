@@ -1,10 +1,11 @@
 """Open scenes by URI: `open_scene("scheme:path?key=value&…")`.
 
 Schemes and syntax are those of adapters.uri. A path without a scheme is recognised by its contents.
-Three keys work with every scheme: `camera_path=FILE` replaces the scene's cameras (see
+Four keys work with every scheme: `camera_path=FILE` replaces the scene's cameras (see
 adapters.camera_files.paths); `ground_z=HEIGHT` gives the height of the road (scene world, metres)
 if the scene does not know it or is wrong; `ego_masks=FOLDER` gives the pixels of recorded images
-that show the recording car (see adapters.ego_masks).
+that show the recording car (see adapters.ego_masks); `tracks=FILE` moves, removes and adds actors
+(see adapters.tracks_file).
 """
 
 from __future__ import annotations
@@ -25,10 +26,12 @@ from adapters.datasets import DATASETS
 from adapters.detect_format import describe_unrecognised, detect_scheme
 from adapters.ego_masks import with_ego_masks
 from adapters.scene_cache import cached_scene
+from adapters.tracks_file import with_tracks
 from adapters.uri import (
     CAMERA_PATH_KEY,
     EGO_MASKS_KEY,
     GROUND_KEY,
+    TRACKS_KEY,
     add_to_uri,
     format_uri,
     known_schemes,
@@ -51,6 +54,7 @@ def open_scene(uri: str) -> Scene:
     camera_path = query.pop(CAMERA_PATH_KEY, None)
     ground_z = query.pop(GROUND_KEY, None)
     ego_masks = query.pop(EGO_MASKS_KEY, None)
+    tracks = query.pop(TRACKS_KEY, None)
     if scheme is None:
         scheme = detect_scheme_of_path(Path(path))
     dataset = DATASETS.get(scheme)
@@ -80,9 +84,11 @@ def open_scene(uri: str) -> Scene:
         scene = _with_ground(scene, ground_z)
     if ego_masks is not None:
         scene = with_ego_masks(scene, Path(ego_masks))
-    if camera_path is None:
-        return scene
-    return with_camera_path(scene, Path(camera_path))
+    if camera_path is not None:
+        scene = with_camera_path(scene, Path(camera_path))
+    if tracks is not None:
+        scene = with_tracks(scene, Path(tracks), path, open_scene)
+    return scene
 
 
 def _with_ground(scene: Scene, text: str) -> Scene:
@@ -256,7 +262,7 @@ def _matches(top: Path, parts: tuple[str, ...], scene_uri: str) -> list[str]:
 def _from(folder: Path, key: str, value: str) -> str:
     """Return a value of the query that names a file beside the job as an absolute path."""
     beside = folder.absolute() / value
-    may_name_a_file = key == EGO_MASKS_KEY or "/" in value or "." in value
+    may_name_a_file = key in (EGO_MASKS_KEY, TRACKS_KEY) or "/" in value or "." in value
     names_a_file = may_name_a_file and beside.exists()
     return str(beside) if names_a_file else value
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from adapters.dataset import Signature
 from adapters.datasets import DATASETS, RECOGNITION_ORDER
-from adapters.uri import CAMERA_PATH_KEY, EGO_MASKS_KEY, GROUND_KEY, parse_uri
+from adapters.uri import CAMERA_PATH_KEY, EGO_MASKS_KEY, GROUND_KEY, TRACKS_KEY, parse_uri
 from augment.errors import AdapterError
 from augment.jobs.mirror import DatasetFolder
 from augment.scene.scene import Scene
@@ -33,6 +33,11 @@ def source_tree(scene: Scene) -> DatasetFolder:
             raise AdapterError(
                 f"{part} shows the frames of a camera path; a dataset's copy takes images of its "
                 f"own frames, leave {CAMERA_PATH_KEY} out"
+            )
+        if TRACKS_KEY in parse_uri(part)[2]:
+            raise AdapterError(
+                f"{part} has moved actors, and a dataset's copy keeps the dataset's own labels and "
+                f"sweeps, which show them where they were recorded; leave {TRACKS_KEY} out"
             )
     scheme, path, query = parse_uri(uri)
     query.pop(GROUND_KEY, None)

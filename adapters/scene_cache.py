@@ -44,7 +44,8 @@ from adapters.datasets import DATASETS
 from adapters.detect_format import detect_scheme
 from adapters.ego_masks import mask_files
 from adapters.scene_folder import with_images_in
-from adapters.uri import EGO_MASKS_KEY, format_uri, parse_uri
+from adapters.tracks_file import other_scenes
+from adapters.uri import EGO_MASKS_KEY, TRACKS_KEY, format_uri, parse_uri
 from augment.errors import AdapterError, ClimateGSError, OutputError, SceneError
 from augment.files.recorded_images import has_image
 from augment.files.scene_file import SCENE_SUFFIX, VERSION, load_scene_parts, save_scene_file
@@ -285,11 +286,16 @@ def scene_digest(uri: str) -> str | None:
     digest.
 
     For a procedural scene it is of its options and the package's version. Masks of the recording
-    car count as files of the scene. The result is None if the
-    scene's files cannot be listed or read; opening the scene then gives the reason.
+    car count as files of the scene, and so do a file of tracks and the scenes that it names. The
+    result is None if the scene's files cannot be listed or read; opening the scene then gives the
+    reason.
     """
     try:
         scheme, path, query = parse_uri(uri)
+        tracks = query.pop(TRACKS_KEY, None)
+        if tracks is not None:
+            scheme = scheme or detect_scheme(Path(path))
+            return _digest_with_tracks(format_uri(str(scheme), path, query), path, Path(tracks))
         scheme = scheme or detect_scheme(Path(path))
         dataset = DATASETS[scheme or ""]
         if path in dataset.builtin:
@@ -298,6 +304,22 @@ def scene_digest(uri: str) -> str | None:
         return _cached_digest([scheme, os.path.abspath(path), sorted(query.items())], files)
     except (KeyError, OSError, ClimateGSError):
         return None
+
+
+def _digest_with_tracks(uri: str, path: str, tracks: Path) -> str | None:
+    """Return the digest of a scene whose actors a file moves; None where one cannot be read.
+
+    Args:
+        uri: the scene's URI without the file.
+        path: the path in it.
+        tracks: the file.
+    """
+    others = other_scenes(tracks, path)
+    digests = [scene_digest(uri), *(scene_digest(other) for other in others)]
+    if None in digests:
+        return None
+    content = _content_digest(tracks, True, tracks.stat().st_size)
+    return _sha256([_DIGEST_FORMAT, digests, content])
 
 
 def _digest_files(scheme: str, path: str, query: Mapping[str, str]) -> dict[str, tuple[Path, bool]]:

@@ -15,7 +15,14 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from adapters.datasets import DATASETS
-from adapters.uri import CAMERA_PATH_KEY, EGO_MASKS_KEY, GROUND_KEY, format_uri, parse_uri
+from adapters.uri import (
+    CAMERA_PATH_KEY,
+    EGO_MASKS_KEY,
+    GROUND_KEY,
+    TRACKS_KEY,
+    format_uri,
+    parse_uri,
+)
 from augment.errors import AdapterError
 from augment.files.scene_file import read_saved_scene
 from augment.scene.cameras import Frame
@@ -106,7 +113,7 @@ def recorded_labels(recording: Recording) -> LabelSource | None:
     """
     if CAMERA_PATH_KEY in recording.query:  # the frames are not the recorded ones
         return None
-    facts = (GROUND_KEY, EGO_MASKS_KEY)  # of scenes, not of labels
+    facts = (GROUND_KEY, EGO_MASKS_KEY, TRACKS_KEY)  # of scenes, not of labels
     query = {key: value for key, value in recording.query.items() if key not in facts}
     return DATASETS[recording.scheme].open_labels(recording.path, query)
 

@@ -21,6 +21,7 @@ from recipes.errors import nearest_word
 CAMERA_PATH_KEY = "camera_path"
 GROUND_KEY = "ground_z"
 EGO_MASKS_KEY = "ego_masks"
+TRACKS_KEY = "tracks"
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9_+.-]*):(?!\\)")
 
 

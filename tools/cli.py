@@ -84,6 +84,8 @@ class RenderOptions(RecipeCommand):
         camera_path: A JSON file of camera poses to render instead of the scene's own.
         ego_masks: A folder of masks of the recording car, as ego_masks=FOLDER in the scene's URI
             (docs/scenes.md): CAMERA.png, white on it, or CAMERA.json with polygons.
+        tracks: A JSON file that moves, removes and adds actors, as tracks=FILE in the scene's URI
+            (docs/scenes.md).
         overwrite: Replace what this scene and recipe wrote before.
         sheet: Also write a contact sheet of the result.
         layout: source: also lay the images into a copy of the scene's dataset, in the place, format
@@ -107,6 +109,7 @@ class RenderOptions(RecipeCommand):
     backend: Backend = "auto"
     camera_path: Path | None = None
     ego_masks: Path | None = None
+    tracks: Path | None = None
     overwrite: bool = False
     sheet: bool = True
     layout: Literal["standard", "source"] = "standard"
@@ -142,6 +145,8 @@ class GenerateOptions(SceneCommand):
         status: Say how far the jobs of the output have come; needs no job file. The exit code is 0
             if all is done.
         rescan: Open all scenes again, in place of what the output knows of them.
+        tracks: A JSON file that moves, removes and adds actors in each scene of the job, as
+            tracks=FILE in its URI does in one (docs/scenes.md).
         scratch: Where images are kept until their block is uploaded, for outputs elsewhere.
         backend: Which rasteriser draws. auto: on the GPU (cuda) where there is one, else the CPU;
             on Ray the CPU.
@@ -155,6 +160,7 @@ class GenerateOptions(SceneCommand):
     dry_run: bool = False
     status: bool = False
     rescan: bool = False
+    tracks: Path | None = None
     scratch: Path | None = None
     backend: Backend = "auto"
 

@@ -21,6 +21,7 @@ from augment.output.names import STATE_FOLDER
 from augment.output.store import open_store
 from recipes.job import load_job, load_job_recipes
 from tools.labels import write_labels_of_job
+from tools.options import with_tracks_key
 from tools.output import LABELS_OF_STORES, duration_text, fill, print_images, print_note
 from tools.warm_up import warm_up_for_workers
 
@@ -48,9 +49,13 @@ def generate_dataset(options: GenerateOptions) -> int:
         open_scene=open_scene,
         scene_digest=scene_digest,
     )
+    scenes = [
+        entry.model_copy(update={"uri": with_tracks_key(entry.uri, options.tracks)})
+        for entry in expand_job_scenes(requested.scenes, job.parent)
+    ]
     task = GenerateJob(
         recipes,
-        expand_job_scenes(requested.scenes, job.parent),
+        scenes,
         setup,
         executor=options.executor,
         workers=options.workers,

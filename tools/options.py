@@ -245,18 +245,35 @@ def with_ego_masks_key(uri: str, folder: Path | None) -> str:
     Raises:
         AdapterError: the URI names a folder of masks already, or is not recognised.
     """
-    if folder is None:
+    from adapters.uri import EGO_MASKS_KEY
+
+    return _with_key(uri, EGO_MASKS_KEY, folder, "--ego-masks", "give masks of the recording car")
+
+
+def with_tracks_key(uri: str, file: Path | None) -> str:
+    """The URI of a scene whose actors a file moves; the URI itself without a file.
+
+    Raises:
+        AdapterError: the URI names a file of tracks already, or is not recognised.
+    """
+    from adapters.uri import TRACKS_KEY
+
+    return _with_key(uri, TRACKS_KEY, file, "--tracks", "move actors")
+
+
+def _with_key(uri: str, key: str, path: Path | None, option: str, purpose: str) -> str:
+    """The URI of a scene with a key that names a path; the URI itself without a path."""
+    if path is None:
         return uri
-    from adapters.uri import EGO_MASKS_KEY, format_uri
+    from adapters.uri import format_uri
     from augment.errors import AdapterError
 
-    scheme, path, query = resolved_uri(uri)
-    if EGO_MASKS_KEY in query:
+    scheme, scene_path, query = resolved_uri(uri)
+    if key in query:
         raise AdapterError(
-            f"--ego-masks {folder} and {EGO_MASKS_KEY}={query[EGO_MASKS_KEY]} in the scene's URI "
-            f"both give masks of the recording car; keep one"
+            f"{option} {path} and {key}={query[key]} in the scene's URI both {purpose}; keep one"
         )
-    return format_uri(scheme, path, {**query, EGO_MASKS_KEY: str(folder.absolute())})
+    return format_uri(scheme, scene_path, {**query, key: str(path.absolute())})
 
 
 def value_or(value: _Value | None, default: _Value) -> _Value:

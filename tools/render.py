@@ -27,7 +27,7 @@ from recipes.load import load_recipe, read_overrides
 from recipes.schema import Recipe, free_knobs, parse_frames
 from tools.labels import write_labels_of_job
 from tools.mirror import clear_notes, mirror_outputs, recipes_for_source
-from tools.options import FITTED, names_in, with_ego_masks_key
+from tools.options import FITTED, names_in, with_ego_masks_key, with_tracks_key
 from tools.output import compiling_noted, print_images, print_note
 from tools.sheet import draw_sheet
 from tools.warm_up import kernel_modules, warm_up
@@ -41,6 +41,7 @@ def render_recipes(options: RenderOptions) -> int:
     out = options.out
     backend = options.backend
     scene_uri = with_ego_masks_key(options.scene, options.ego_masks)
+    scene_uri = with_tracks_key(scene_uri, options.tracks)
     recipes = resolve_recipes(options.recipes, options.variants, options.scale, options.overrides)
     trial_recipes = [recipe for resolved in recipes for recipe in recipes_to_try(resolved)]
     on_gpu = renders_on_gpu(backend)

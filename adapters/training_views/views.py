@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from adapters.ego_masks import read_ego_masks
 from adapters.training_views.depth_priors import DepthPriors, DepthSource, ReferenceDepth
-from augment.errors import AdapterError
+from augment.errors import AdapterError, SceneError
 from augment.files.recorded_images import ImageFault, read_scaled
 from augment.memo import SceneMemo
 from augment.photo.lidar_view import lidar_top_rad
@@ -88,6 +88,11 @@ class RecordedViews:
         """
         if not 0 < scale <= 1:
             raise ValueError(f"scale must be > 0 and <= 1; got {scale}")
+        if scene.moved_instances:
+            raise SceneError(
+                f"scene {scene.name!r} has moved actors, and its images show them where they were "
+                f"recorded, so nothing can be learnt from them; leave tracks out of the URI"
+            )
         names = _camera_names(scene, cameras)
         step = holdout_step(holdout)
         self._scene = scene

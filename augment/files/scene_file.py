@@ -588,6 +588,11 @@ def scene_document(scene: Scene, precision: Precision = "float32") -> dict[str, 
 
     Where precision is not float32, made_by records it permanently.
     """
+    if scene.moved_instances:
+        raise SceneError(
+            f"scene {scene.name!r} has moved actors, and a scene file keeps where they were "
+            f"recorded; save it without tracks, and name the file of tracks when it is opened"
+        )
     kind = SKY_KINDS.get(type(scene.sky))
     if kind is None:
         raise SceneError(

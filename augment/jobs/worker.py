@@ -46,6 +46,7 @@ from augment.scene.box_estimates import evidence_of
 from augment.scene.boxes import Instances
 from augment.scene.cameras import Camera, Frame
 from augment.scene.labels import Boxes, LidarSweep
+from augment.scene.moved_actors import RECORDED_SWEEPS
 from augment.scene.scene import Scene
 from augment.view.box_labels import label_view, uses_boxes
 from augment.view.render_view import ViewPool
@@ -351,9 +352,10 @@ class FrameRunner:
             return PassedLidar()
         paths = item_paths(self._scene.name, recipe, "", chunk.frame)
         target = Path(self._setup.out_dir) / (paths["lidar"] or "")
+        is_moved = bool(self._scene.moved_instances)
         if target.exists() and not self._setup.overwrite:
             with contextlib.suppress(OutputError):  # a damaged file is written again
-                return _lidar_entries(recipe, read_lidar_note(target))
+                return _lidar_entries(recipe, read_lidar_note(target), is_moved)
         with self._times.measure(LIDAR):
             try:
                 sweep = self._scene.lidar(chunk.frame)
@@ -364,7 +366,7 @@ class FrameRunner:
             except Exception as error:
                 return describe_error(error, "reading the LiDAR sweep")
             write_atomic(target, data, clear=False)
-            return _lidar_entries(recipe, fault)
+            return _lidar_entries(recipe, fault, is_moved)
 
     def _weathered(
         self, sweep: LidarSweep, frame: int, recipe: Recipe
@@ -390,15 +392,20 @@ class FrameRunner:
             return sweep, fault
 
 
-def _lidar_entries(recipe: Recipe, fault: str | None) -> PassedLidar:
+def _lidar_entries(recipe: Recipe, fault: str | None, is_moved: bool) -> PassedLidar:
     """Return the manifest's entries of a sweep.
 
     Args:
         fault: Reason why it has no weather although it should; None otherwise.
+        is_moved: If True, actors of the scene are elsewhere than in the sweep.
     """
-    if fault is None:
-        return PassedLidar(recipe.lidar, recipe.lidar_note(recipe.lidar))
-    return PassedLidar("clean", f"{recipe.lidar_note('clean')}: {fault}")
+    lidar = recipe.lidar if fault is None else "clean"
+    note = recipe.lidar_note(lidar)
+    if fault is not None:
+        note = f"{note}: {fault}"
+    if is_moved:
+        note = RECORDED_SWEEPS if note is None else f"{RECORDED_SWEEPS}; {note}"
+    return PassedLidar(lidar, note)
 
 
 def _make_pump(setup: SceneSetup) -> WritePump:

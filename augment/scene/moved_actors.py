@@ -232,9 +232,9 @@ def check_track_ids(scene: Scene, track_ids: Collection[str]) -> None:
 
 
 def _recorded_tracks(scene: Scene) -> dict[str, Track]:
-    """Return the recorded track of each actor, by track id."""
+    """Return the recorded track of each recorded actor, by track id."""
     recorded = scene if scene.recorded is None else scene.recorded
-    return {actor.track_id: actor.track for actor in recorded.actors}
+    return {actor.track_id: actor.track for actor in recorded.actors if not actor.track.is_absent}
 
 
 def _with_actors(
