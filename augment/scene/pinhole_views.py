@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.interpolate import RectBivariateSpline
 
 from augment.scene.cameras import Camera
@@ -105,7 +105,7 @@ class LensLayout:
     """Unit directions of its pixels in the camera's axes; (0, 0, 1) outside."""
 
     @property
-    def main_view(self) -> Float64[np.ndarray, "H W"]:
+    def main_view(self) -> Int64[np.ndarray, "H W"]:
         """Return the index of the view with the largest weight at each pixel."""
         return np.argmax([view.weights for view in self.views], axis=0)
 

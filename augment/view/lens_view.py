@@ -260,5 +260,5 @@ def _join(
         ),
         trust=join([picture.trust for picture in pictures]),
         own_car=join([picture.own_car for picture in pictures]),
-        is_inside=join([picture.is_inside for picture in pictures], value=1),
+        is_inside=join([picture.is_inside for picture in pictures], value=1.0),
     )
