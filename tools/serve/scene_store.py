@@ -168,6 +168,7 @@ class SceneStore:
         self._on_open = on_open
         self._changed = threading.Condition()
         self._entry_by_name: dict[str, _Entry] = {}
+        self._num_opening = 0
         self._use_numbers = itertools.count(1)
         for source in sources:
             self._add(source)
@@ -255,18 +256,21 @@ class SceneStore:
                 continue
             try:
                 if entry.open_scene is None:
-                    self._make_room(check)
-                    check()
-                    opened = self._open(entry.source, entry.name)
-                    with self._changed:
-                        entry.open_scene = opened
+                    with self._place(check):
+                        opened = self._open(entry.source, entry.name)
+                        with self._changed:
+                            entry.open_scene = opened
             finally:
                 entry.opening.release()
 
-    def _make_room(self, check: Callable[[], None]) -> None:
-        """Close scenes that nobody uses, the one used longest ago first, until there is room."""
+    @contextlib.contextmanager
+    def _place(self, check: Callable[[], None]) -> Iterator[None]:
+        """Hold a place for a scene that is opened inside.
+
+        Scenes that nobody uses are closed for it, the one used longest ago first.
+        """
         with self._changed:
-            while self.num_open >= self._max_open:
+            while self.num_open + self._num_opening >= self._max_open:
                 idle_entries = [
                     entry
                     for entry in self._entry_by_name.values()
@@ -278,12 +282,19 @@ class SceneStore:
                     continue
                 self._changed.wait(0.1)
                 check()
+            self._num_opening += 1
+        try:
+            check()
+            yield
+        finally:
+            with self._changed:
+                self._num_opening -= 1
+                self._changed.notify_all()
 
     def _add(self, source: SceneSource) -> None:
         """Open a scene for the first time, and offer it."""
-        if self.num_open >= self._max_open:
-            self._make_room(lambda: None)
-        opened = self._open(source, source.name)
+        with self._place(lambda: None):
+            opened = self._open(source, source.name)
         name = opened.name
         if name in self._entry_by_name:
             raise ClimateGSError(
