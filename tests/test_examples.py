@@ -14,7 +14,14 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "docs" / "examples"
 # Examples that take some 10 s of processor time; the others take 6 s, most of it for imports.
-LONG_EXAMPLES = {"own_drive", "own_effect", "robust_detector", "train_detector", "train_on_fog"}
+LONG_EXAMPLES = {
+    "closed_loop",
+    "own_drive",
+    "own_effect",
+    "robust_detector",
+    "train_detector",
+    "train_on_fog",
+}
 MAX_LINES = 64  # an example is read from top to bottom in a few minutes
 
 
@@ -47,6 +54,7 @@ def finds_the_cars(picture: np.ndarray) -> bool:
 
 # What the picture of each example must show, by name.
 SHOWS = {
+    "closed_loop": fades_to_the_right,
     "first_fog": fades_to_the_right,
     "own_drive": fades_to_the_right,
     "own_effect": is_sepia_far_away,

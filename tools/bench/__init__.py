@@ -253,6 +253,43 @@ def bench_trade(
     return 0
 
 
+def bench_serve(
+    scene: str | None = None,
+    recipe: str = "dense-fog",
+    scale: float = 0.5,
+    minutes: float = 10.0,
+    clients: int = 2,
+    repeats: int = 5,
+    quick: bool = False,
+    json_file: JsonFile = None,
+) -> int:
+    """Measure the sensor service beside a job, and a soak: latencies and memory over minutes.
+
+    Args:
+        scene: The scene that is served; by default the procedural street.
+        recipe: Its weather.
+        scale: The size of the images over the recorded size.
+        minutes: The length of the soak; 0 for none.
+        clients: The number of clients of the soak, which replay closed loops of all cameras.
+        repeats: The number of rounds beside a job; 0 for none.
+        quick: Small images, one round, and a soak of seconds.
+        json_file: Also write the figures to this file.
+    """
+    subject = _subject("serve")
+    case = subject.QUICK_CASE
+    if not quick:
+        case = dataclasses.replace(
+            subject.FULL_CASE,
+            scene=scene or subject.FULL_CASE.scene,
+            recipe=recipe,
+            scale=scale,
+            minutes=minutes,
+            clients=clients,
+            repeats=repeats,
+        )
+    return _show(subject.measure(case), json_file)
+
+
 COMMANDS = {
     "raster": bench_raster,
     "lod": bench_lod,
@@ -263,6 +300,7 @@ COMMANDS = {
     "dataset": bench_dataset,
     "training": bench_training,
     "detector": bench_detector,
+    "serve": bench_serve,
     "gpu": bench_gpu,
 }
 
