@@ -216,8 +216,8 @@ TINY_CASE = dataclasses.replace(
     QUICK_CASE,
     train_scenes=QUICK_CASE.train_scenes[:1],
     settings=dataclasses.replace(QUICK_CASE.settings, steps=100),
-    effects=("fog",),
-    levels=(5,),
+    effects=("lens",),
+    levels=(1,),
 )
 
 
@@ -232,8 +232,8 @@ def test_a_second_run_renders_nothing_and_gives_the_same_scores(tmp_path):
     second = measure(folder=tmp_path, case=TINY_CASE, scene_loader=refuse_scene)
     assert second["tables"][:-1] == first["tables"][:-1]
     assert set(first["facts"]["scores"]) == {*ARMS}
-    curve = first["facts"]["curves"]["clean"]["fog"]
-    assert [point["variant"] for point in curve] == ["clean-0", "fog-5"]
+    curve = first["facts"]["curves"]["clean"]["lens"]
+    assert [point["variant"] for point in curve] == ["clean-0", "lens-1"]
     json.dumps(first)
     titles = {name: arm.title for name, arm in detector.ARMS.items()}
     draw_curves(tmp_path / "curves.png", first["facts"]["curves"], titles)
