@@ -248,3 +248,15 @@ def test_moves_that_cannot_be_are_refused_in_words() -> None:
     for words, call in refusals.items():
         with pytest.raises(SceneError, match=words):
             call()
+
+
+def test_a_moved_scene_with_other_frames_is_recorded_in_these_frames() -> None:
+    scene, _ = moved_street()
+    fewer = dataclasses.replace(scene, frames=scene.frames[:2])
+    recorded = fewer.as_recorded
+    assert recorded.frames is fewer.frames
+    assert recorded.actors is scene.as_recorded.actors
+    assert recorded is fewer.as_recorded
+    assert scene.as_recorded is scene.recorded
+    plain, _ = street()
+    assert plain.as_recorded is plain
