@@ -1,4 +1,5 @@
 import dataclasses
+import pickle
 
 import numpy as np
 import pytest
@@ -260,3 +261,11 @@ def test_a_moved_scene_with_other_frames_is_recorded_in_these_frames() -> None:
     assert scene.as_recorded is scene.recorded
     plain, _ = street()
     assert plain.as_recorded is plain
+
+
+def test_a_moved_scene_that_travels_to_another_process_still_shares_its_recorded_one() -> None:
+    moved, _ = moved_street()
+    there = pickle.loads(pickle.dumps(moved))
+    assert there.as_recorded is there.recorded
+    assert there.moved_instances == moved.moved_instances
+    assert there.boxes(1).track_ids == moved.boxes(1).track_ids
