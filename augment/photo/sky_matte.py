@@ -109,7 +109,6 @@ def sky_matte(
     Returns:
         The matte; None where there is no image that can be read, or where it is too dark to tell.
     """
-    scene = scene.as_recorded
     frame = recorded_frame(scene, camera)
     if frame is None:
         return None
@@ -124,7 +123,7 @@ def sky_matte(
             return None
     image = rgb
     key = "sky matte", frame.index, camera.name, camera.width, camera.height, camera.cx, camera.cy
-    packed = memo_of(scene).get(key, lambda: _refine(image, regions))
+    packed = memo_of(scene.as_recorded).get(key, lambda: _refine(image, regions))
     return SkyMatte(*unpack_matte(packed, image))
 
 

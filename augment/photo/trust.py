@@ -41,7 +41,7 @@ from augment.render.constants import SURFACE_ALPHA
 from augment.render.rasterize import rasterize
 from augment.scene.cameras import Camera, Frame
 from augment.scene.labels import EGO_VEHICLE
-from augment.scene.scene import Scene
+from augment.scene.scene import Scene, Track
 
 # Distance from which a surface before the sky fades in any fog and casts no pane, metres.
 SKY_FROM_M = 200.0
@@ -640,7 +640,7 @@ def _move_with_actors(
     for instance in np.unique(owner[owner > 0]):
         is_owned = owner == instance
         pose_before = scene.actors[instance - 1].track.pose_at(from_ns)
-        pose_after = _recorded_pose(scene, int(instance), to_ns)
+        pose_after = _recorded_track(scene, int(instance)).pose_at(to_ns)
         if pose_before is None or pose_after is None:
             moved_points[is_owned] = np.nan
             continue
@@ -649,15 +649,12 @@ def _move_with_actors(
     return moved_points
 
 
-def _recorded_pose(
-    scene: Scene, instance: int, timestamp_ns: int
-) -> Float[torch.Tensor, "4 4"] | None:
-    """Return the pose in which images recorded an actor, or the one that it is a copy of."""
+def _recorded_track(scene: Scene, instance: int) -> Track:
+    """Return the track on which images recorded an actor, or the one that it is a copy of."""
     recorded_actors = scene.as_recorded.actors
     source_id = recorded_actors[instance - 1].copy_of
     source_tracks = [actor.track for actor in recorded_actors if actor.track_id == source_id]
-    track = source_tracks[0] if source_tracks else recorded_actors[instance - 1].track
-    return track.pose_at(timestamp_ns)
+    return source_tracks[0] if source_tracks else recorded_actors[instance - 1].track
 
 
 def _project_points(camera: Camera, points: np.ndarray) -> np.ndarray:
