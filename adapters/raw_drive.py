@@ -25,6 +25,13 @@ from pydantic import BeforeValidator, Field
 
 from adapters.drive_checks import camera_problems, lidar_problems
 from adapters.plain_files import MISSING, check_image
+from adapters.recorded_lenses import (
+    LENS_MEANING,
+    RECORDED_LENS,
+    UNDISTORTED_LENS,
+    LensChoice,
+    with_recorded_frames,
+)
 from adapters.uri import UriOptions
 from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN, UNCHANGED, is_in_air
 from augment.errors import AdapterError
@@ -97,7 +104,9 @@ class DriveOptions(UriOptions):
     that images are decoded at for colours and sky, as JPEGs can be without a second resize.
     sky_size: texels along an edge of the sky's cube map. held_out: frames that the Gaussians, their
     colours and the sky are made without; they stay in the scene, and their boxes still make
-    tracks. depth: a user's depth maps for surfaces beyond the LiDAR's view."""
+    tracks. depth: a user's depth maps for surfaces beyond the LiDAR's view. lens: recorded for
+    cameras with the dataset's lenses and its images as recorded; the scene itself is made from
+    undistorted images all the same."""
 
     frames: Annotated[range, BeforeValidator(lambda text: _frame_range(text, 2))] = Field(
         range(sys.maxsize),
@@ -121,6 +130,12 @@ class DriveOptions(UriOptions):
         description="a folder of depth maps, FOLDER/<camera>/<frame>.png or .npy, also as "
         "metric:FOLDER or relative:FOLDER",
     )
+    lens: LensChoice = Field(UNDISTORTED_LENS, description=LENS_MEANING)
+
+    @property
+    def has_recorded_lens(self) -> bool:
+        """Return True if the scene's cameras keep the lenses of the dataset."""
+        return self.lens == RECORDED_LENS
 
     def select(self, numbers: Sequence[int], *, where: str) -> DriveFrames:
         """Select the scene's frames from the dataset's, which ascend. where: for messages."""
@@ -625,6 +640,8 @@ class RawDrive:
         used_rows: fraction of the rows from the top that does not show the car, by camera.
         grey_cameras: cameras without colours.
         colour_every: step between the used frames that give colours and sky.
+        recorded_frames: the same frames with the dataset's lenses and its images as recorded, which
+            the scene gets in place of `frames`. None if the scene keeps `frames`.
     """
 
     name: str
@@ -641,6 +658,7 @@ class RawDrive:
     grey_cameras: frozenset[str] = frozenset()
     colour_every: int = 1
     has_metric_scale: bool = True
+    recorded_frames: tuple[Frame, ...] | None = None
 
     def __post_init__(self) -> None:
         """
@@ -721,7 +739,8 @@ def scene_of_drive(
             drive,
             ground,
         )
-    return build_lidar_scene(drive, options, added=extra_background, ground=ground)
+    scene = build_lidar_scene(drive, options, added=extra_background, ground=ground)
+    return with_recorded_frames(scene, drive.recorded_frames)
 
 
 def _check_frames_of_reference(drive: RawDrive) -> RawDrive:

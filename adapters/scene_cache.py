@@ -58,6 +58,7 @@ from augment.output.atomic import (
 )
 from augment.output.names import STATE_FOLDER
 from augment.render.cpu.kernel_cache import user_cache_folder
+from augment.scene.cameras import Frame
 from augment.scene.labels import LabelSource
 from augment.scene.scene import Scene, is_drawable
 from recipes.files import open_file
@@ -105,15 +106,20 @@ def cached_scene(
                 if can_write:
                     _store(scene, folder, key, limit_bytes)
                 return scene
+    seen_frames = stored_scene.seen_frames
     return replace(
         stored_scene,
         source=format_uri(scheme, path, query),
-        frames=tuple(
-            with_images_in(path, frame, os.path.abspath(path)) for frame in stored_scene.frames
-        ),
+        frames=_with_images_in(path, stored_scene.frames),
+        seen_frames=None if seen_frames is None else _with_images_in(path, seen_frames),
         labels=open_labels(),
         recorded_source=None,
     )
+
+
+def _with_images_in(path: str, frames: Sequence[Frame]) -> tuple[Frame, ...]:
+    """Return frames whose images below the scene's path are named as the path is."""
+    return tuple(with_images_in(path, frame, os.path.abspath(path)) for frame in frames)
 
 
 def image_folder(name: str, sources: Sequence[Path]) -> Path:
@@ -149,7 +155,8 @@ def _make_room_for_images(folder: Path, limit_bytes: float) -> None:
 def _has_images(scene: Scene, folder: Path) -> bool:
     """True if all of the scene's images that belong beside the cache's folder exist."""
     image_prefix = str(folder.with_name(_IMAGES)) + os.sep
-    paths = (path for frame in scene.frames for path in frame.image_paths.values())
+    frames = (*scene.frames, *(scene.seen_frames or ()))
+    paths = (path for frame in frames for path in frame.image_paths.values())
     return all(has_image(Path(path)) for path in paths if path.startswith(image_prefix))
 
 

@@ -154,6 +154,18 @@ def memo_of(owner: Any) -> SceneMemo:
         return memo
 
 
+def share_memo(owner: Any, other: Any) -> None:
+    """Give an object the memo of another one, for two that differ in nothing that is computed.
+
+    Args:
+        owner: the object with the memo.
+        other: the object that gets it.
+    """
+    memo = memo_of(owner)
+    with _lock:
+        _memos[other] = memo
+
+
 _memos: WeakKeyDictionary[Any, SceneMemo] = WeakKeyDictionary()
 _lock = threading.Lock()
 

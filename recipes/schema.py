@@ -176,7 +176,7 @@ class Weather(ClosedModel):
 class Render(Section):
     """How the scene is drawn."""
 
-    later_fields = ("base", "exposure", "own_car")
+    later_fields = ("base", "exposure", "own_car", "shutter_strips")
     knobs = (
         Knob(
             "scale",
@@ -204,6 +204,9 @@ class Render(Section):
     own_car: Literal["dry", "snowy"] = "dry"
     """Of base recorded: dry keeps all weather off the pixels that show the recording car; snowy
     lets snow that lies on the scene lie on it, too."""
+    shutter_strips: Whole = Field(default=16, ge=1, le=4096)
+    """Strips of rows in which an image of a rolling shutter is drawn, each at the pose and time of
+    its middle; cameras without one are drawn at once."""
     speed: Speed = Speed()
 
     @property

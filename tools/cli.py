@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self, get_args
 
 import tyro
 from pydantic import AfterValidator, Field, model_validator
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from augment.files.formats import ExportKind, SplatKind, join_names
 from tools.options import (
@@ -402,6 +402,8 @@ class RecordOptions(Command):
             recording has no metres.
         positions: A CSV table with the columns image, lat, lon, or image, x, y in metres: where
             images were taken. It also turns the recording's x to the east.
+        lens: recorded keeps the images as they are, and their lens in calibration.json; undistorted
+            takes the distortion out of them.
     """
 
     model: Positional[Path]
@@ -410,6 +412,7 @@ class RecordOptions(Command):
     fps: Annotated[float, Field(gt=0, le=1000)]
     camera_height: Annotated[float, Field(gt=0.05, le=20)] | None = None
     positions: Path | None = None
+    lens: Literal["undistorted", "recorded"] = "undistorted"
 
     def run(self) -> int:
         from tools.record import record_drive
@@ -601,6 +604,65 @@ class ViewOptions(RecipeCommand):
         return view_scene(self)
 
 
+class ServeOptions(RecipeCommand):
+    """Serve scenes in their weather to closed-loop simulators over gRPC (docs/simulator.md).
+
+    It has the interface of AlpaSim's and NuRec's renderers. Clients name a scene, or
+    SCENE@RECIPE#VARIANT.
+
+    Args:
+        scenes: Scenes, as for render; NAME=URI gives one the name that clients ask for.
+        recipe: A recipe file or the name of a preset that clients may choose; may be given several
+            times. The first is the weather of a scene without @RECIPE. clear by default.
+        variants: How many draws from each recipe's ranges. The recipe's own number by default.
+        host: The address to listen at. 127.0.0.1 is for programs of this machine.
+        port: 0 takes a free one.
+        max_scenes: Scenes in memory, at most; the others are opened when they are asked for.
+        max_requests: Requests in flight, at most. Further ones are refused.
+        max_pixels: Pixels of an image, at most.
+        tls_cert: A PEM file with the server's certificate; clients then connect by TLS.
+        tls_key: A PEM file with its private key.
+        tls_client_ca: A PEM file; only clients with a certificate of this authority are served.
+        log: Print a line for each request to stderr.
+        metrics: At the end also write counts and latencies to this JSON file.
+        backend: Which rasteriser draws. auto: on the GPU (cuda) where there is one, else the CPU.
+    """
+
+    scenes: Positional[
+        Annotated[
+            tuple[str, ...], arg(metavar="SCENE [SCENE ...]", help_behavior_hint="(required)")
+        ]
+    ]
+    recipe: Annotated[tuple[str, ...], UseAppendAction] = ()
+    variants: Count | None = None
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 50051
+    max_scenes: Count = 4
+    max_requests: Annotated[int, Field(ge=1, le=1024)] = 32
+    max_pixels: Annotated[int, Field(ge=1, le=1 << 24)] = 1 << 23
+    tls_cert: Path | None = None
+    tls_key: Path | None = None
+    tls_client_ca: Path | None = None
+    log: bool = False
+    metrics: Path | None = None
+    backend: Backend = "auto"
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        if not self.scenes:
+            raise ValueError("no scene is named: climategs serve SCENE --recipe RECIPE")
+        if (self.tls_cert is None) != (self.tls_key is None):
+            raise ValueError("--tls-cert and --tls-key belong together: give both, or neither")
+        if self.tls_client_ca is not None and self.tls_cert is None:
+            raise ValueError("--tls-client-ca needs --tls-cert and --tls-key")
+        return self
+
+    def run(self) -> int:
+        from tools.serve.server import serve_scenes
+
+        return serve_scenes(self)
+
+
 def demo(out: Path = Path("out/demo"), frames: int = 10) -> int:
     """Render the embedded street under five recipes, with a contact sheet and a video.
 
@@ -714,6 +776,8 @@ class ScoreCommand(Command):
         nuscenes: The folder of nuScenes, for NDS by nuscenes-devkit.
         nuscenes_version: The version of its tables.
         nuscenes_split: The split whose samples the predictions have.
+        nuscenes_python: The Python that has nuscenes-devkit, if it is not this one: the devkit
+            needs an older NumPy.
         truth: Write the truth of each variant as a COCO file into this folder, with the numbers of
             images and categories, and score nothing.
         html: The page to write. By default PREDICTIONS/score.html.
@@ -730,6 +794,7 @@ class ScoreCommand(Command):
     nuscenes: Path | None = None
     nuscenes_version: str = "v1.0-trainval"
     nuscenes_split: str = "val"
+    nuscenes_python: Path | None = None
     truth: Path | None = None
     html: Path | None = None
     json_file: JsonFile = None
@@ -843,6 +908,7 @@ COMMANDS = {
     "inspect": InspectOptions,
     "explain": ExplainOptions,
     "view": ViewOptions,
+    "serve": ServeOptions,
     "recipes": RecipesOptions,
     "sheet": SheetOptions,
     "report": ReportOptions,

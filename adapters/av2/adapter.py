@@ -61,6 +61,7 @@ from adapters.raw_drive import (
     scene_of_drive,
     usable_images,
 )
+from adapters.recorded_lenses import no_lens_note
 from adapters.uri import format_uri
 from augment.effects.lidar.codes import CODE_COLUMN, INDEX_COLUMN, UNCHANGED
 from augment.errors import AdapterError
@@ -581,6 +582,7 @@ def read_av2(log: Av2Log, source: str, options: DriveOptions) -> RawDrive:
             *images.problems,
             *sweep_problems,
             *box_problems,
+            *no_lens_note("images of Argoverse 2", options.lens),
         ),
         grey_cameras=grey,
         colour_every=colour_every(num_colored),

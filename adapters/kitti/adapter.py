@@ -34,6 +34,7 @@ from adapters.kitti.files import (
     VELODYNE,
     Calibration,
     Poses,
+    Size,
     frame_times,
     is_object_folder,
     kitti_root,
@@ -48,6 +49,13 @@ from adapters.kitti.files import (
     registered_poses,
     resolve_file,
     rotation_about,
+)
+from adapters.kitti.unsynced import (
+    is_unsynced,
+    match_images,
+    pose_path,
+    poses_at_sweeps,
+    unsynced_times,
 )
 from adapters.plain_files import parse_numbers, read_text
 from adapters.raw_drive import (
@@ -67,8 +75,10 @@ from adapters.raw_drive import (
     stored_records,
     usable_images,
 )
+from adapters.recorded_lenses import UNDISTORTED_LENS, LensChoice, split_lenses
 from adapters.uri import format_uri
 from augment.errors import AdapterError
+from augment.files.image_size import read_image_header
 from augment.scene.cameras import Camera, Frame
 from augment.scene.geometry import invert_rigid, quat_from_rotmat
 from augment.scene.labels import Boxes, LidarSweep
@@ -186,9 +196,13 @@ class KittiLabels:
     def lidar_content(self, frame_index: int, file: Path, sweep: LidarSweep) -> bytes:
         """Return the content of a file that holds a weathered sweep instead of the recorded one."""
         records = read_returns(self.root, self.sweeps[frame_index])
-        return stored_records(
+        content = stored_records(
             records, _RECORD_COLUMNS, sweep, self.world_from_velodyne[frame_index]
         )
+        if file.suffix.lower() != ".txt":
+            return content
+        rows = np.frombuffer(content, "<f4").reshape(-1, len(_RECORD_COLUMNS))
+        return "".join("{:.6f} {:.6f} {:.6f} {:.6f}\n".format(*row) for row in rows).encode()
 
 
 def object_label_file(root: Path, frame: int) -> Path:
@@ -397,7 +411,15 @@ def read_kitti(path: str, query: dict[str, str], source: DriveSource) -> RawDriv
         for files in [source.images[name]]
     ]
     images = usable_images(pictures)
-    frames = tuple(_frame(source, images, number) for number in source.selection.numbers)
+    recorded_frames = tuple(_frame(source, images, number) for number in source.selection.numbers)
+    lens_frames = split_lenses(
+        source.name,
+        recorded_frames,
+        source.lens,
+        published="KITTI's images, rectified in all releases but that before synchronisation "
+        "(`_extract`),",
+    )
+    frames = lens_frames.frames
     used = [frame for frame in frames if frame.index not in source.selection.held_out]
     sweeps, sweep_problems = _read_sweeps(labels, used)
     objects = find_objects(
@@ -414,7 +436,14 @@ def read_kitti(path: str, query: dict[str, str], source: DriveSource) -> RawDriv
         labels=labels,
         world_origin_m=source.world_origin_m,
         lidar_top_deg=_LIDAR_TOP_DEG,
-        problems=(*source.problems, *images.problems, *sweep_problems, *objects.problems),
+        problems=(
+            *source.problems,
+            *lens_frames.notes,
+            *images.problems,
+            *sweep_problems,
+            *objects.problems,
+        ),
+        recorded_frames=lens_frames.recorded_frames,
     )
 
 
@@ -458,8 +487,14 @@ def _read_sweeps(
 def _frame(source: DriveSource, images: DriveImages, number: int) -> Frame:
     """Return a frame with all cameras of the calibration."""
     pose = recenter_pose(source.labels.world_from_velodyne[number], source.world_origin_m)
-    ego_from_world = invert_rigid(pose)
     time = source.labels.timestamps_ns[number]
+
+    def velodyne_from_world(name: str) -> torch.Tensor:
+        image_pose = source.image_poses.get(name, {}).get(number)
+        if image_pose is None:
+            return invert_rigid(pose)
+        return invert_rigid(recenter_pose(image_pose, source.world_origin_m))
+
     return Frame(
         index=number,
         timestamp_ns=time,
@@ -469,7 +504,9 @@ def _frame(source: DriveSource, images: DriveImages, number: int) -> Frame:
                 name,
                 *images.sizes[name],
                 *camera.lens,
-                camera_from_world=torch.from_numpy(camera.camera_from_velodyne) @ ego_from_world,
+                camera_from_world=torch.from_numpy(camera.camera_from_velodyne)
+                @ velodyne_from_world(name),
+                lens=camera.distortion,
                 timestamp_ns=source.image_times_ns.get(name, {}).get(number, time),
             )
             for name, camera in source.calibration.cameras.items()
@@ -491,6 +528,9 @@ class DriveSource:
         labels: labels of all frames with poses, in the dataset's world.
         world_origin_m: float64 [3], subtracted from the dataset's coordinates.
         problems: one sentence each.
+        image_poses: world_from_velodyne at the times of images, by camera and frame, where it is
+            another than the frame's.
+        lens: the option of that name.
     """
 
     name: str
@@ -501,6 +541,8 @@ class DriveSource:
     labels: KittiLabels
     world_origin_m: np.ndarray
     problems: tuple[str, ...]
+    image_poses: Mapping[str, Mapping[int, np.ndarray]] = field(default_factory=dict)
+    lens: LensChoice = UNDISTORTED_LENS
 
 
 def find_source(path: str, query: dict[str, str]) -> tuple[DriveSource, KittiOptions]:
@@ -514,27 +556,52 @@ def find_source(path: str, query: dict[str, str]) -> tuple[DriveSource, KittiOpt
         raise AdapterError(
             f"kitti: {unsupported_option}= means nothing for {data_kind}; it is {meaning}"
         )
-    return (_object_source if is_object else _raw_source)(root, calibration, options), options
+    source = (_object_source if is_object else _raw_source)(root, calibration, options)
+    return replace(source, lens=options.lens), options
 
 
 def _raw_source(root: Path, calibration_folder: Path, options: KittiOptions) -> DriveSource:
     """Return the contents of a raw drive."""
     sweeps = list_numbered_files(root, f"{VELODYNE}/data", (".bin",), RAW_DIGITS)
+    if not sweeps:
+        sweeps = list_numbered_files(root, f"{VELODYNE}/data", (".txt",), RAW_DIGITS)
     images, problems = _raw_images(root)
+    image_times = {name: read_times(root, name) for name in images}
+    has_unsynced_files = is_unsynced(sweeps)
     numbers = sorted(set(sweeps).union(*images.values()))
+    if has_unsynced_files:
+        numbers = sorted(set(sweeps) & set(unsynced_times(root, VELODYNE)))
     if not sweeps:
         raise AdapterError(
-            f"{root / VELODYNE / 'data'} holds no sweep NNNNNNNNNN.bin; a scene cannot be built "
-            f"without them, unpack the drive again"
+            f"{root / VELODYNE / 'data'} holds no sweep NNNNNNNNNN.bin or .txt; a scene "
+            f"cannot be built without them, unpack the drive again"
         )
     selection = options.select(numbers, where=f"kitti:{root}")
-    calibration = read_raw_calibration(calibration_folder, images)
-    image_times = {name: read_times(root, name) for name in images}
+    calibration = read_raw_calibration(calibration_folder, _image_sizes(root, images))
     known_times = read_times(root, VELODYNE) or next(filter(None, image_times.values()), {})
     times, time_problems = frame_times(root, known_times, numbers)
     poses = _raw_poses(root, calibration_folder, calibration, options, numbers, selection, sweeps)
+    image_poses: dict[str, dict[int, np.ndarray]] = {}
+    if has_unsynced_files:
+        sweep_times = {number: times[number] for number in numbers}
+        has_packets = options.poses is None and len(selection.numbers) > 1
+        pose_times = unsynced_times(root, "oxts") if has_packets else sweep_times
+        path = pose_path(poses.world_from_velodyne, pose_times)
+        if has_packets:
+            poses = poses_at_sweeps(path, sweep_times, poses)
+        images, image_times, match_problems = match_images(
+            root,
+            images,
+            {name: unsynced_times(root, name) for name in images},
+            {number: times[number] for number in selection.numbers},
+        )
+        image_poses = {
+            name: {n: pose for n, t in of_camera.items() if (pose := path.at(t)) is not None}
+            for name, of_camera in image_times.items()
+        }
+        problems = (*problems, *match_problems)
     world_from_velodyne = poses.world_from_velodyne
-    tracklets = read_tracklets(root)
+    tracklets = None if has_unsynced_files else read_tracklets(root)
     labels = KittiLabels(root, sweeps, times, world_from_velodyne)
     if tracklets is not None:
         labels = replace(labels, tracklets=tracklets)
@@ -549,7 +616,7 @@ def _raw_source(root: Path, calibration_folder: Path, options: KittiOptions) -> 
             if missing_frames
             else ()
         ),
-        *(() if tracklets is not None else (f"{root} has no {TRACKLETS}: no boxes are known",)),
+        *(() if tracklets is not None else (_no_boxes_note(root, has_unsynced_files),)),
     )
     frames_with_pose = DriveFrames(
         tuple(n for n in selection.numbers if n in world_from_velodyne), selection.held_out
@@ -568,7 +635,28 @@ def _raw_source(root: Path, calibration_folder: Path, options: KittiOptions) -> 
         labels,
         drive_origin(np.stack([pose[:3, 3] for _, pose in sorted(world_from_velodyne.items())])),
         problems,
+        image_poses,
     )
+
+
+def _no_boxes_note(root: Path, has_unsynced_files: bool) -> str:
+    """Return the sentence on a drive without boxes."""
+    if has_unsynced_files:
+        return (
+            f"{root} is a drive before synchronisation: tracklets count the frames of the "
+            f"synchronised release, so no boxes are known"
+        )
+    return f"{root} has no {TRACKLETS}: no boxes are known"
+
+
+def _image_sizes(root: Path, images: Mapping[str, Mapping[int, str]]) -> dict[str, Size | None]:
+    """Return width and height of each camera's first image that has a header; None without."""
+    sizes: dict[str, Size | None] = {}
+    for name, files in images.items():
+        headers = (read_image_header(resolve_file(root, file)) for file in files.values())
+        header = next((header for header in headers if header is not None), None)
+        sizes[name] = None if header is None else header.size
+    return sizes
 
 
 def _raw_images(root: Path) -> tuple[dict[str, dict[int, str]], tuple[str, ...]]:

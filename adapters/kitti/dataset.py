@@ -7,7 +7,7 @@ from pathlib import Path
 
 from adapters.dataset import Dataset, FolderLayout, OpenLabels, Signature, SourceTree
 
-_SWEEP = r"velodyne_points/data/\d+\.bin"
+_SWEEP = r"velodyne_points/data/\d+\.(bin|txt)"
 _IMAGE = r"image_\d\d/data/\d+\.(?i:png|jpg)"
 _CALIBRATION = "calib_*.txt"
 

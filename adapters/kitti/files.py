@@ -40,6 +40,7 @@ from adapters.plain_files import (
 )
 from adapters.raw_drive import describe_frames
 from augment.errors import AdapterError
+from augment.scene.lenses import OpenCVLens
 
 CAM_TO_CAM = "calib_cam_to_cam.txt"
 VELODYNE = "velodyne_points"
@@ -60,6 +61,8 @@ _TIME_PATTERN = re.compile(r"(19[7-9]\d|20\d\d|21\d\d)-\d\d-\d\d \d\d:\d\d:\d\d(
 _RETURN_BYTES = 16
 # Largest file of a sweep. A turn of the sensor is 2 MB.
 _MAX_BYTES = 512 * 2**20
+# Width and height, pixels.
+Size = tuple[int, int]
 
 # Radius of KITTI's Mercator projection.
 EARTH_RADIUS_M = 6378137.0
@@ -170,11 +173,13 @@ class RectifiedCamera(NamedTuple):
         lens: fx, fy, cx, cy in pixels.
         camera_from_velodyne: float64 [4, 4].
         size: width and height in pixels. None if the calibration does not state them.
+        distortion: lens of images that are not rectified; None for rectified ones.
     """
 
     lens: tuple[float, float, float, float]
     camera_from_velodyne: np.ndarray
     size: tuple[int, int] | None
+    distortion: OpenCVLens | None = None
 
 
 class Calibration(NamedTuple):
@@ -234,25 +239,30 @@ class KeyedLines:
         return checked_pose(matrix, f"{self.path}: {keys}")
 
 
-def read_raw_calibration(folder: Path, names: Iterable[str]) -> Calibration:
+def read_raw_calibration(folder: Path, image_sizes: Mapping[str, Size | None]) -> Calibration:
     """Read the calibration of a day's drives.
+
+    Images of the size before rectification (S_xx) are those of an unrectified release: their
+    cameras have the intrinsics K_xx, the distortion D_xx and the pose R_xx, T_xx. All others are
+    rectified, and have P_rect_xx.
 
     Args:
         folder: the folder of the calibration files.
-        names: the cameras, such as image_02.
+        image_sizes: width and height of the images, None if not known, by camera, such as image_02.
     """
     calibration_lines = KeyedLines.read(folder, CAM_TO_CAM)
     camera_from_velodyne = KeyedLines.read(folder, "calib_velo_to_cam.txt").pose("R", "T")
     rectified_from_velodyne = calibration_lines.pose("R_rect_00") @ camera_from_velodyne
-    return Calibration(
-        {
-            n: _read_camera(
-                calibration_lines, n.replace("image", "P_rect"), rectified_from_velodyne
+    cameras = {}
+    for name, size in image_sizes.items():
+        number = name.removeprefix("image_")
+        if size is not None and _is_unrectified(calibration_lines, number, size):
+            cameras[name] = _read_unrectified(calibration_lines, number, camera_from_velodyne)
+        else:
+            cameras[name] = _read_camera(
+                calibration_lines, f"P_rect_{number}", rectified_from_velodyne
             )
-            for n in names
-        },
-        rectified_from_velodyne,
-    )
+    return Calibration(cameras, rectified_from_velodyne)
 
 
 def read_object_calibration(folder: Path, frame: str, names: Iterable[str]) -> Calibration:
@@ -304,9 +314,40 @@ def _read_camera(
     )
 
 
-def _read_image_size(calibration_lines: KeyedLines, key: str) -> tuple[int, int] | None:
+def _is_unrectified(calibration_lines: KeyedLines, number: str, size: Size) -> bool:
+    """Return True if images of this size are those before rectification."""
+    recorded_size = _read_image_size(calibration_lines, f"S_{number}")
+    return size == recorded_size != _read_image_size(calibration_lines, f"S_rect_{number}")
+
+
+def _read_unrectified(
+    calibration_lines: KeyedLines, number: str, camera_from_velodyne: np.ndarray
+) -> RectifiedCamera:
+    """Return a camera before rectification.
+
+    Args:
+        calibration_lines: the calibration of the cameras.
+        number: the camera's two digits.
+        camera_from_velodyne: float64 [4, 4], into camera 0 before rectification.
+    """
+    k = calibration_lines.numbers(f"K_{number}", 3, 3)
+    pinhole = np.array([[k[0, 0], 0, k[0, 2]], [0, k[1, 1], k[1, 2]], [0, 0, 1]])
+    if not (np.allclose(k, pinhole, atol=1e-6) and k[0, 0] > 0 and k[1, 1] > 0):
+        raise AdapterError(
+            f"{calibration_lines.path}: K_{number} must be fx 0 cx 0 fy cy 0 0 1 with fx, fy > 0; "
+            f"got {k.tolist()}"
+        )
+    distortion = OpenCVLens.from_coefficients(calibration_lines.numbers(f"D_{number}", 5).tolist())
+    # OpenCV, in whose model the calibration is, has whole numbers at the middle of pixels.
+    lens = (float(k[0, 0]), float(k[1, 1]), float(k[0, 2]) + 0.5, float(k[1, 2]) + 0.5)
+    pose = calibration_lines.pose(f"R_{number}", f"T_{number}") @ camera_from_velodyne
+    size = _read_image_size(calibration_lines, f"S_{number}")
+    return RectifiedCamera(lens, pose, size, distortion)
+
+
+def _read_image_size(calibration_lines: KeyedLines, key: str) -> Size | None:
     """Return the width and height of a camera's image in the calibration, or None without them."""
-    if not key.startswith("S_rect") or key not in calibration_lines.lines:
+    if not key.startswith("S_") or key not in calibration_lines.lines:
         return None
     width, height = calibration_lines.numbers(key, 2)
     if not (1 <= width <= 1e5 and 1 <= height <= 1e5 and width % 1 == 0 and height % 1 == 0):
@@ -374,10 +415,20 @@ def frame_times(
 def read_returns(root: Path, name: str) -> np.ndarray:
     """Read a sweep's returns as stored, float32 [N, 4]: x y z and reflectance.
 
+    A file ending in .txt has a line of four numbers for each return.
+
     x y z are metres in the Velodyne's frame. A turn takes 0.1 s; the displacement of the points by
     the car's motion during the turn is not corrected.
     """
     path = resolve_file(root, name)
+    if path.suffix.lower() == ".txt":
+        values = read_numbers(path)
+        if not values.size or values.size % 4:
+            raise AdapterError(
+                f"{path} must have four numbers (x y z reflectance) for each return; it has "
+                f"{values.size}. Copy it again"
+            )
+        return values.astype(np.float32).reshape(-1, 4)
     try:
         size = path.stat().st_size
         if size == 0 or size % _RETURN_BYTES or size > _MAX_BYTES:

@@ -50,6 +50,7 @@ from adapters.raw_drive import (
     usable_images,
     world_classes,
 )
+from adapters.recorded_lenses import no_lens_note
 from adapters.uri import format_uri
 from augment.effects.lidar.codes import INDEX_COLUMN, is_in_air
 from augment.errors import AdapterError
@@ -449,7 +450,13 @@ def read_nuscenes(path: str, query: dict[str, str], options: NuScenesOptions) ->
         labels=NuScenesLabels(tables, files),
         world_origin_m=origin,
         lidar_top_deg=_LIDAR_TOP_DEG,
-        problems=image_problems + selection.problems + problems + images.problems,
+        problems=(
+            *image_problems,
+            *selection.problems,
+            *problems,
+            *images.problems,
+            *no_lens_note("images of nuScenes", options.lens),
+        ),
         used_rows=_ROWS_ABOVE_CAR,
     )
 

@@ -53,6 +53,7 @@ from adapters.raw_drive import (
     usable_images,
     world_classes,
 )
+from adapters.recorded_lenses import no_lens_note
 from adapters.safe_pickle import read_frame
 from adapters.uri import format_uri
 from augment.effects.lidar.codes import INDEX_COLUMN, is_in_air
@@ -108,7 +109,12 @@ def read_pandaset(path: str, query: dict[str, str], options: DriveOptions) -> Ra
         labels=PandaSetLabels(root),
         world_origin_m=origin,
         lidar_top_deg=_LIDAR_TOP_DEG,
-        problems=(*problems, *chosen.problems, *more),
+        problems=(
+            *problems,
+            *chosen.problems,
+            *more,
+            *no_lens_note("PandaSet's images", options.lens),
+        ),
         used_rows=_ROWS_ABOVE_CAR,
     )
 

@@ -49,6 +49,7 @@ from adapters.raw_drive import (
     scene_of_drive,
     world_classes,
 )
+from adapters.recorded_lenses import split_lenses
 from adapters.recording.files import (
     CALIBRATION,
     Calibration,
@@ -511,7 +512,14 @@ def read_recording(
     numbers = [frame.index for frame in calibration.frames]
     chosen = options.select(numbers, where=f"recording:{path}")
     listed = [frame for frame in calibration.frames if frame.index in set(chosen.numbers)]
-    frames, image_problems = find_images(root, listed)
+    recorded_frames, image_problems = find_images(root, listed)
+    lens_frames = split_lenses(
+        calibration.name,
+        recorded_frames,
+        options.lens,
+        published=f"images of {root}, whose {CALIBRATION} states no lens,",
+    )
+    frames = lens_frames.frames
     used = [frame for frame in frames if frame.index not in chosen.held_out]
     objects = read_objects(root, frames, calibration.world_origin_m)
     lidar = read_lidar_drive(root, calibration, used)
@@ -531,8 +539,10 @@ def read_recording(
             *chosen.problems,
             *objects.problems,
             *lidar.problems,
+            *lens_frames.notes,
         ),
         has_metric_scale=calibration.has_metric_scale,
+        recorded_frames=lens_frames.recorded_frames,
     )
     return drive, calibration
 
@@ -557,7 +567,9 @@ def _best_scene(
     if count >= _MIN_RETURNS or not any(frame.image_paths for frame in drive.used):
         return scene_of_drive(drive, options)
     start = f"{root / 'lidar'} holds {count or 'no'} returns"
-    sweeps, problems = depth_sweeps(root, drive.used)
+    used_numbers = {frame.index for frame in drive.used}
+    used = [frame for frame in calibration.frames if frame.index in used_numbers]
+    sweeps, problems = depth_sweeps(root, used)  # depth images have the lens of the image
     if any(map(len, sweeps)):
         start += f": the scene starts from the points of {len(sweeps)} depth images"
         problems = (*drive.problems, *problems, start)
@@ -623,7 +635,8 @@ def back_project(depth_m: np.ndarray, camera: Camera) -> Sweep:
     """Return points of a depth image [H, W], about _POINTS_PER_IMAGE at most, on a regular grid
     of pixels.
 
-    Pixels without depth, far away, or on edges between near and far give no point.
+    Depth is z, or the distance along the ray if the camera's lens says so. Pixels without depth,
+    far away, or on edges between near and far give no point.
     """
     inverse = np.where(depth_m > 0, 1 / np.maximum(depth_m, 1e-3), 0).astype(np.float32)
     usable = (depth_m > 0) & (depth_m < _MAX_DEPTH_M)
@@ -634,10 +647,16 @@ def back_project(depth_m: np.ndarray, camera: Camera) -> Sweep:
     rows = rows * step + step // 2
     columns = columns * step + step // 2
     z = depth_m[rows, columns].astype(np.float64)
-    local = np.stack(
-        [(columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z, z],
-        axis=1,
-    )
+    if camera.lens is not None:
+        pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
+        rays, is_inside = camera.lens.rays(pixels, camera.intrinsics)
+        if not camera.lens.is_depth_along_ray:
+            rays = rays / rays[:, 2:]
+        local = (rays * z[:, None])[is_inside]
+    else:
+        x = (columns + 0.5 - camera.cx) / camera.fx
+        y = (rows + 0.5 - camera.cy) / camera.fy
+        local = np.stack([x * z, y * z, z], axis=1)
     pose = camera.world_from_camera.numpy()
     return Sweep.of_unknown_class(local @ pose[:3, :3].T + pose[:3, 3], camera.timestamp_ns)
 

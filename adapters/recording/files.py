@@ -38,6 +38,7 @@ from pydantic import AfterValidator, BaseModel, Field
 from adapters.plain_files import Number, read_json, validate_content
 from adapters.raw_drive import NO_SURFACE, Picture, drive_origin, usable_images
 from augment.errors import AdapterError, SceneError
+from augment.files.lens_records import LensRecord, ShutterRecord
 from augment.output.manifest import MAX_SIDE_PX
 from augment.output.names import folder_name
 from augment.scene.cameras import Camera, Frame
@@ -189,11 +190,17 @@ def _classes(names: Any) -> Mapping[int, int] | None:
     return classes
 
 
+# Numbers of a camera's entry that are the camera's own.
+_CAMERA_NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")
+
 _Pose = Annotated[tuple[_Row, _Row, _Row, _Row], AfterValidator(_rigid)]
 
 
 class _CameraEntry(BaseModel):
-    """One camera in one frame of calibration.json. timestamp_ns: None for the frame's time."""
+    """One camera in one frame of calibration.json. timestamp_ns: None for the frame's time.
+
+    lens, shutter: None for a pinhole, and if all pixels are exposed at once.
+    """
 
     width: _Pixels
     height: _Pixels
@@ -203,6 +210,8 @@ class _CameraEntry(BaseModel):
     cy: Number
     world_from_camera: _Pose
     timestamp_ns: _Nanoseconds | None = None
+    lens: LensRecord | None = None
+    shutter: ShutterRecord | None = None
 
 
 class _FrameEntry(BaseModel):
@@ -314,11 +323,20 @@ def _frame(path: Path, content: Any) -> Frame:
     for name, values in entry.cameras.items():
         camera_where = f"{where}, camera {name!r:.80}"
         camera = validate_content(_CameraEntry, values, camera_where, hint=_HINT)
-        lens = camera.model_dump(exclude={"world_from_camera", "timestamp_ns"})
+        numbers = {key: getattr(camera, key) for key in _CAMERA_NUMBERS}
         pose = invert_rigid(camera.world_from_camera)
         time = entry.timestamp_ns if camera.timestamp_ns is None else camera.timestamp_ns
         try:
-            cameras[name] = Camera(name, **lens, camera_from_world=pose, timestamp_ns=time)
+            lens = None if camera.lens is None else camera.lens.lens()
+            shutter = None if camera.shutter is None else camera.shutter.shutter()
+            cameras[name] = Camera(
+                name,
+                **numbers,
+                camera_from_world=pose,
+                timestamp_ns=time,
+                lens=lens,
+                shutter=shutter,
+            )
         except ValueError as error:
             raise AdapterError(f"{camera_where}: {error}") from None
     try:

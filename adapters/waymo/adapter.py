@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import torch
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
@@ -47,8 +48,10 @@ from adapters.waymo.tables import (
     MAX_SIDE,
     STAMP,
     TOP,
+    Mount,
     Rows,
     Segment,
+    Shot,
     extract_images,
     find_segment,
     read_segment,
@@ -66,8 +69,10 @@ from augment.files.packed_images import (
 from augment.scene.cameras import Camera, Frame
 from augment.scene.geometry import invert_rigid
 from augment.scene.labels import Boxes, LidarSweep
+from augment.scene.lenses import OpenCVLens
 from augment.scene.scene import Scene
 from augment.scene.semantics import SemanticClass
+from augment.scene.shutter import RollingShutter
 
 _SPIN_NS = 100_000_000  # the TOP laser turns ten times a second
 # The recording car in its own frame, a sedan or van of 4.7 to 5.2 m whose rear axle is 1.1 m from
@@ -75,6 +80,7 @@ _SPIN_NS = 100_000_000  # the TOP laser turns ten times a second
 EGO_M = np.array([[-1.15, -1.1, -0.5], [4.1, 1.1, 2.3]])
 _MAX_FAULTS = 3  # sweeps with a sentence of their own
 _MAX_RETURNS = 12_000_000  # that a scene is built from; each takes 50 bytes on the way
+_MAX_READOUT_S = 0.2  # a longer readout is a mix-up of units
 _THREADS = 4  # NumPy releases the interpreter
 
 # ---- Range images --------------------------------------------------------------------------------
@@ -626,9 +632,21 @@ def read_waymo(path: str, query: dict[str, str], options: WaymoOptions) -> RawDr
     with ThreadPoolExecutor(1) as pool:  # both are decoders' work, without the interpreter
         coloured = set(chosen.used[::step])
         images = pool.submit(extract_images, segment, chosen.numbers, coloured)
+        recorded_paths = None
+        if options.has_recorded_lens:
+            recorded_paths, _ = extract_images(segment, chosen.numbers, (), is_undistorted=False)
         sweeps, sweep_problems = read_sweeps(segment, chosen.used, origin)
         paths, image_problems = images.result()
     frames = tuple(_frame(segment, n, origin, paths[n]) for n in chosen.numbers)
+    recorded_frames = None
+    if recorded_paths is not None:
+        usable_paths = {
+            n: {name: recorded_paths[n][name] for name in frame_paths}
+            for n, frame_paths in paths.items()
+        }
+        recorded_frames = tuple(
+            _frame(segment, n, origin, usable_paths[n], has_lens=True) for n in chosen.numbers
+        )
     boxes, box_problems = moving_boxes(segment, chosen.numbers, origin)
     labels = WaymoLabels(segment)
     return RawDrive(
@@ -647,9 +665,10 @@ def read_waymo(path: str, query: dict[str, str], options: WaymoOptions) -> RawDr
             *image_problems,
             *sweep_problems,
             *box_problems,
-            *_notes(segment, chosen.numbers),
+            *_notes(segment, chosen.numbers, has_recorded_lens=options.has_recorded_lens),
         ),
         colour_every=step,
+        recorded_frames=recorded_frames,
     )
 
 
@@ -665,7 +684,8 @@ def waymo_files(path: Path | str, query: dict[str, str]) -> list[Path]:
     return [files.path(component) for component in COMPONENTS]
 
 
-def _notes(segment: Segment, numbers: Sequence[int]) -> list[str]:
+def _notes(segment: Segment, numbers: Sequence[int], *, has_recorded_lens: bool) -> list[str]:
+    """Return sentences on boxes, lenses and read-outs."""
     notes = []
     if not segment.files.has("lidar_box"):
         path = segment.files.path("lidar_box")
@@ -673,12 +693,19 @@ def _notes(segment: Segment, numbers: Sequence[int]) -> list[str]:
     shots = [shot for n in numbers for shot in segment.shots.get(n, {}).values()]
     longest_s = max((shot.readout_s for shot in shots), default=0.0)
     distorted = [name for name, mount in segment.cameras.items() if not mount.lens.is_pinhole]
-    if distorted:
+    if distorted and not has_recorded_lens:
         notes.append(
             f"images of {', '.join(distorted)} are without their lens distortion, in copies that "
-            f"cameras and weather go with"
+            f"cameras and weather go with; lens=recorded keeps lens and read-out"
         )
-    if len(numbers) > 1 and longest_s:
+    if has_recorded_lens:
+        unknown = [name for name, mount in segment.cameras.items() if mount.read_out is None]
+        notes += [
+            f"camera_calibration states no rolling shutter of {name}: all of its columns show the "
+            f"middle of the readout"
+            for name in unknown
+        ]
+    if len(numbers) > 1 and longest_s and not has_recorded_lens:
         steps_m = np.linalg.norm(np.diff(segment.world_from_vehicle[:, :3, 3], axis=0), axis=1)
         speeds = steps_m / (np.diff(segment.pose_times_ns) * 1e-9)
         half_m = float(speeds.max()) * longest_s / 2
@@ -689,7 +716,19 @@ def _notes(segment: Segment, numbers: Sequence[int]) -> list[str]:
     return notes
 
 
-def _frame(segment: Segment, n: int, origin: np.ndarray, paths: dict[str, str]) -> Frame:
+def _frame(
+    segment: Segment, n: int, origin: np.ndarray, paths: dict[str, str], *, has_lens: bool = False
+) -> Frame:
+    """Return a frame.
+
+    Args:
+        segment: the segment.
+        n: the frame's number.
+        origin: subtracted from the dataset's coordinates, float64 [3].
+        paths: the frame's images by camera.
+        has_lens: if True, cameras have their lens and rolling shutter; if False, they are the
+            pinholes of undistorted images.
+    """
     cameras = {}
     for name, mount in segment.cameras.items():
         shot = segment.shots.get(n, {}).get(name)
@@ -700,9 +739,13 @@ def _frame(segment: Segment, n: int, origin: np.ndarray, paths: dict[str, str]) 
             name,
             mount.lens.width,
             mount.lens.height,
-            *mount.lens.pinhole,
+            *(mount.lens.intrinsics if has_lens else mount.lens.pinhole),
             camera_from_world=invert_rigid(pose),
             timestamp_ns=shot.timestamp_ns,
+            lens=OpenCVLens.from_coefficients(mount.lens.coefficients)
+            if has_lens and not mount.lens.is_pinhole
+            else None,
+            shutter=_shutter(mount, shot) if has_lens else None,
         )
     return Frame(
         index=n,
@@ -710,6 +753,29 @@ def _frame(segment: Segment, n: int, origin: np.ndarray, paths: dict[str, str]) 
         world_from_ego=recenter_pose(segment.world_from_vehicle[n], origin),
         cameras=cameras,
         image_paths=paths,
+    )
+
+
+def _shutter(mount: Mount, shot: Shot) -> RollingShutter | None:
+    """Return the rolling shutter of an image; None for a global or an unknown one.
+
+    A column at the share s of the image's width is exposed around trigger + shutter / 2 + s T, with
+    T from the first to the last column: T / 2 before and after the middle of the readout.
+    """
+    if mount.read_out is None or not 0 < shot.readout_s <= _MAX_READOUT_S:
+        return None
+    starts_and_ends = [
+        invert_rigid(
+            torch.from_numpy(shot.world_from_vehicle_at(offset_s) @ mount.vehicle_from_camera)
+        )
+        for offset_s in (-shot.readout_s / 2, shot.readout_s / 2)
+    ]
+    middle = torch.from_numpy(shot.world_from_vehicle @ mount.vehicle_from_camera)
+    return RollingShutter.between(
+        *starts_and_ends,
+        read_out=mount.read_out,
+        duration_ns=round(shot.readout_s * 1e9),
+        camera_from_world=invert_rigid(middle),
     )
 
 

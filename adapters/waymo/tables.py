@@ -28,6 +28,7 @@ from augment.errors import AdapterError
 from augment.files.packed_images import NUMBER_LISTS, Lens, PackedImages, is_number, parquet_errors
 from augment.output.manifest import MAX_SIDE_PX
 from augment.output.tables import read_table
+from augment.scene.shutter import ReadOut
 
 COMPONENTS = {
     "vehicle_pose": "VehiclePoseComponent",
@@ -51,6 +52,17 @@ MAX_SIDE = 10_000  # of a range image; published ones have 2650 columns
 _CAMERA_FROM_OPENCV = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 _LATEST_S = 9e9  # nanoseconds in int64 reach 9.2e18
 _NEAR_S = 0.25  # an image is taken this close to its frame's time
+# Directions of the read-out, by the dataset's numbers and names.
+_READ_OUTS: Mapping[Any, ReadOut] = {
+    1: "top_to_bottom",
+    2: "left_to_right",
+    3: "bottom_to_top",
+    4: "right_to_left",
+    "TOP_TO_BOTTOM": "top_to_bottom",
+    "LEFT_TO_RIGHT": "left_to_right",
+    "BOTTOM_TO_TOP": "bottom_to_top",
+    "RIGHT_TO_LEFT": "right_to_left",
+}
 _SPIN_NS = 100_000_000  # one turn of the TOP laser, from the frame's time on
 _ADVICE = "write it as the dataset does, or copy the dataset's own file"
 
@@ -239,6 +251,12 @@ class Rows:
         word_of |= {f"TYPE_{word.upper()}": word for word in words}
         return [word_of.get(value, "Unknown") for value in self._words(field)]
 
+    def read_outs(self, field: str) -> list[ReadOut | None]:
+        """Return the direction of each row's read-out; None for a global or an unknown one."""
+        if not self.has(field):
+            return [None] * len(self)
+        return [_READ_OUTS.get(value) for value in self._words(field)]
+
     def _words(self, field: str) -> list[Any]:
         """Return a column of numbers, texts or None."""
         column = self.column(field)
@@ -285,10 +303,18 @@ def _flat(cell: Any) -> np.ndarray:
 
 
 class Mount(NamedTuple):
-    """A camera on the car. vehicle_from_camera: float64 [4, 4], OpenCV axes."""
+    """A camera on the car.
+
+    Attributes:
+        lens: size, intrinsics and distortion.
+        vehicle_from_camera: float64 [4, 4], OpenCV axes.
+        read_out: direction in which its rows or columns are read; None for a global shutter, or if
+            the calibration does not say.
+    """
 
     lens: Lens
     vehicle_from_camera: np.ndarray
+    read_out: ReadOut | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,6 +361,8 @@ class Shot(NamedTuple):
         pose_ns: time of the pose that the dataset gives.
         readout_s: duration of the readout, 0 if it is not known.
         row: row of the image in camera_image.
+        velocity: float64 [6], metres a second in world axes, radians a second in vehicle axes; 0
+            where it is not known.
     """
 
     timestamp_ns: int
@@ -342,6 +370,15 @@ class Shot(NamedTuple):
     pose_ns: int
     readout_s: float
     row: int
+    velocity: np.ndarray
+
+    def world_from_vehicle_at(self, offset_s: float) -> np.ndarray:
+        """Return the vehicle's pose at a time after the middle of the readout, float64 [4, 4]."""
+        pose = self.world_from_vehicle.copy()
+        pose[:3, 3] += self.velocity[:3] * offset_s
+        turn = Rotation.from_rotvec(self.velocity[3:] * offset_s).as_matrix()
+        pose[:3, :3] = pose[:3, :3] @ turn
+        return pose
 
 
 # ---- The segment ---------------------------------------------------------------------------------
@@ -421,7 +458,9 @@ def _read_cameras(files: SegmentFiles) -> dict[str, Mount]:
     numbers = [f"intrinsic.{n}" for n in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")]
     key = "key.camera_name"
     pose = "extrinsic.transform"
-    rows = Rows(files, "camera_calibration", [key, *numbers, pose, "width", "height"])
+    direction = "rolling_shutter_direction"
+    rows = Rows(files, "camera_calibration", [key, *numbers, pose, "width", "height", direction])
+    read_outs = rows.read_outs(direction)
     vehicle_from_camera = rows.poses(pose) @ _CAMERA_FROM_OPENCV
     sizes = np.stack([rows.finite("width"), rows.finite("height")], axis=1)
     if not ((sizes >= 1) & (sizes <= MAX_SIDE_PX)).all():
@@ -437,7 +476,7 @@ def _read_cameras(files: SegmentFiles) -> dict[str, Mount]:
             _ = lens.pinhole
         except ValueError as error:
             raise rows.fault("intrinsic.f_u", f"and the others: camera {name}, {error}") from None
-        mounts[name] = Mount(lens, vehicle_from_camera[i])
+        mounts[name] = Mount(lens, vehicle_from_camera[i], read_outs[i])
     return {name: mounts[name] for name in CAMERAS if name in mounts}
 
 
@@ -506,6 +545,7 @@ def _read_shots(segment: Segment) -> tuple[dict[int, dict[str, Shot]], tuple[str
             int(pose_ns[i]),
             float(readout_s[i]),
             int(rows.numbers[i]),
+            np.where(has_motion[i], velocity[i], 0.0).astype(np.float64),
         )
         if name in shots.setdefault(frame, {}):
             raise rows.fault(key, f"has two images of {name} at {segment.stamps_us[frame]}")
@@ -525,17 +565,25 @@ _MAX_FAULTS = 3  # images with a sentence of their own
 
 
 def extract_images(
-    segment: Segment, numbers: Sequence[int], now: Collection[int]
+    segment: Segment, numbers: Sequence[int], now: Collection[int], *, is_undistorted: bool = True
 ) -> tuple[dict[int, dict[str, str]], tuple[str, ...]]:
-    """Return the paths of the frames' undistorted images by frame and camera, and the problems.
+    """Return the paths of the frames' images by frame and camera, and the problems.
 
     The images lie in the user's cache (`adapters.scene_cache.image_folder`). Those of the frames in
     `now` are written at once, each other one when it is first read. A problem is a sentence about
-    images that cannot be used."""
+    images that cannot be used.
+
+    Args:
+        segment: the segment.
+        numbers: the frames.
+        now: the frames whose images are written at once.
+        is_undistorted: if True, images lose their distortion, and are checked; if False, the files
+            have the bytes of the table, and nothing is checked.
+    """
     if not segment.shots:
         return {n: {} for n in numbers}, ()
     files = [segment.files.path(name) for name in ("camera_image", "camera_calibration")]
-    folder = image_folder(segment.files.name, files)
+    folder = image_folder(segment.files.name + ("" if is_undistorted else "-recorded"), files)
     shots = {
         f"{name}/{segment.stamps_us[n]}.jpg": (n, name, shot.row)
         for n, frame_shots in segment.shots.items()
@@ -544,13 +592,17 @@ def extract_images(
     packed = PackedImages(
         table=os.path.abspath(files[0]),
         column=f"[{COMPONENTS['camera_image']}].image",
-        lenses={name: mount.lens for name, mount in segment.cameras.items()},
+        lenses={
+            name: mount.lens if is_undistorted else mount.lens.without_distortion
+            for name, mount in segment.cameras.items()
+        },
         rows={file: row for file, (_, _, row) in shots.items()},
     )
     frames = set(numbers)
     requested = {file: shot for file, shot in shots.items() if shot[0] in frames}
+    checked_names = list(requested) if is_undistorted else []
     faults = packed.write_folder(
-        folder, list(requested), [f for f, shot in requested.items() if shot[0] in now]
+        folder, checked_names, [f for f in checked_names if requested[f][0] in now]
     )
     sentences = [
         f"camera {name}, frame {n}: its image {faults[file]}; left out"

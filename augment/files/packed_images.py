@@ -14,6 +14,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -180,6 +181,21 @@ class Lens:
     def is_pinhole(self) -> bool:
         """True for a lens without distortion."""
         return not any((self.k1, self.k2, self.p1, self.p2, self.k3))
+
+    @property
+    def without_distortion(self) -> Lens:
+        """The same image with no distortion to take out: its bytes stay as they are."""
+        return replace(self, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0)
+
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """The recorded fx, fy, cx, cy, pixels."""
+        return self.f_u, self.f_v, self.c_u, self.c_v
+
+    @property
+    def coefficients(self) -> tuple[float, float, float, float, float]:
+        """The distortion in OpenCV's order: k1, k2, p1, p2, k3."""
+        return self.k1, self.k2, self.p1, self.p2, self.k3
 
     def project(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Project rays (x, y, 1), OpenCV axes, into recorded pixels.

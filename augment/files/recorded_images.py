@@ -62,21 +62,27 @@ def decode_image(path: Path, flags: int) -> np.ndarray | None:
 
 
 def has_image(path: Path) -> bool:
-    """Return True if the image exists, or can be written from a table (see packed_images)."""
+    """Return True if the image exists, or can be written from a table or from a recorded image.
+
+    See `packed_images` and `undistorted_images`.
+    """
     if path.is_file():
         return True
-    from augment.files.packed_images import is_packed  # imported here: it loads pyarrow
+    # Imported here: packed_images loads pyarrow.
+    from augment.files.packed_images import is_packed
+    from augment.files.undistorted_images import is_undistorted_copy
 
-    return is_packed(path)
+    return is_undistorted_copy(path) or is_packed(path)
 
 
 def _unpack_fault(path: Path) -> str:
-    """Write the image if it is missing and a table has it; return what is wrong with it there."""
+    """Write the image if it is missing and can be made; return the fault of its source, or ""."""
     if os.path.lexists(path):
         return ""
     from augment.files.packed_images import unpack_image
+    from augment.files.undistorted_images import unpack_copy
 
-    return unpack_image(path)
+    return unpack_copy(path) or unpack_image(path)
 
 
 class ImageFault(Exception):

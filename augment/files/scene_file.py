@@ -39,11 +39,13 @@ from torch import Tensor
 from augment.detail.lod import store_levels
 from augment.errors import OutputError, SceneError
 from augment.files.checkpoints import checked_tensor
+from augment.files.lens_records import LensRecord, ShutterRecord, lens_record, shutter_record
 from augment.files.level_file import LEVELS, read_levels
 from augment.files.limits import check_values, validate_model
 from augment.files.tensors import read_tensors, write_tensors
 from augment.output.atomic import write_file_atomically, write_folder_atomically
 from augment.scene.cameras import Camera, Frame
+from augment.scene.lenses import FisheyeLens, FThetaLens, OpenCVLens
 from augment.scene.scene import (
     NUM_SH_BY_DEGREE,
     Actor,
@@ -58,6 +60,7 @@ from augment.scene.scene import (
     is_drawable,
 )
 from augment.scene.semantics import SemanticClass
+from augment.scene.shutter import RollingShutter
 from augment.scene.sky import ConstantSky, CubemapSky, LatLongSky, Sky
 from recipes.files import open_file
 
@@ -344,6 +347,17 @@ def _pose_as_list(value: object) -> object:
     return _as_list(value)
 
 
+def _lens_as_record(value: object) -> object:
+    """Return a lens as its JSON object."""
+    is_lens = isinstance(value, OpenCVLens | FisheyeLens | FThetaLens)
+    return lens_record(value) if is_lens else value
+
+
+def _shutter_as_record(value: object) -> object:
+    """Return a shutter as its JSON object."""
+    return shutter_record(value) if isinstance(value, RollingShutter) else value
+
+
 def _check_rigid(rows: list) -> list:
     """Check that poses [4, 4] or [N, 4, 4] are rotations and translations."""
     poses = np.array(rows, np.float64).reshape(-1, 4, 4)
@@ -406,11 +420,18 @@ class CameraEntry(_Closed):
     timestamp_ns: Int64
     camera_from_world: Pose
     is_orthographic: bool = False
+    lens: Annotated[LensRecord | None, BeforeValidator(_lens_as_record)] = None
+    shutter: Annotated[ShutterRecord | None, BeforeValidator(_shutter_as_record)] = None
 
     @model_serializer(mode="wrap")
     def _omit_defaults(self, serialize: Callable[..., dict[str, Any]]) -> dict[str, Any]:
         entry = serialize(self)
-        return entry if self.is_orthographic else {k: entry[k] for k in list(entry)[:-1]}
+        for name in ("is_orthographic", "lens", "shutter"):  # so that older versions still read it
+            if not entry[name]:
+                del entry[name]
+        if self.lens is not None:
+            entry["lens"] = lens_record(self.lens.lens())
+        return entry
 
 
 class FrameEntry(_Closed):
@@ -739,6 +760,8 @@ def _frame(entry: FrameEntry) -> Frame:
     for name, camera in entry.cameras.items():
         numbers = {field: getattr(camera, field) for field in CameraEntry.model_fields}
         numbers["camera_from_world"] = pose(camera.camera_from_world)
+        numbers["lens"] = None if camera.lens is None else camera.lens.lens()
+        numbers["shutter"] = None if camera.shutter is None else camera.shutter.shutter()
         cameras[name] = Camera(name=name, **numbers)
     world_from_ego = pose(entry.world_from_ego)
     return Frame(entry.index, entry.timestamp_ns, world_from_ego, cameras, entry.image_paths)

@@ -18,10 +18,14 @@ import numpy as np
 import torch
 
 from augment.errors import OutputError
+from augment.files.lens_records import lens_of_record, optics_record, shutter_of_record
 from augment.output.atomic import read_file
 from augment.output.tables import checked_int
 from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import invert_rigid
+from augment.scene.lenses import Lens
 from augment.scene.scene_index import SceneIndex
+from augment.scene.shutter import RollingShutter
 
 # Explanations that the file itself carries.
 CONVENTIONS = {
@@ -35,6 +39,21 @@ CONVENTIONS = {
     "u = fx x / z + cx, v = fy y / z + cy, where the centre of the first pixel is (0.5, 0.5)",
     "timestamp_ns": "of a frame: its reference time; of a camera: when its image was taken",
     "depth": "uint16 PNG, metres x 256 along the optical axis, 0 = none",
+}
+# Explanations in place of these, and beside them, in a file with cameras that are no pinholes.
+LENS_CONVENTIONS = {
+    "intrinsics": "pixels of the written images, where the centre of the first pixel is (0.5, 0.5)."
+    " A camera without a lens is a pinhole: u = fx x / z + cx, v = fy y / z + cy. With a lens, fx, "
+    "fy, cx, cy are the numbers of its model",
+    "lens": "model opencv: as cv2.projectPoints, coefficients k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4; "
+    "opencv_fisheye: as cv2.fisheye, k1 to k4; ftheta: polynomials between the angle in radians and"
+    " the distance in pixels of the calibrated image, whose slope at the axis is fx of that image. "
+    "Coefficients that are left out are 0. OpenCV's own pixel coordinates are smaller by 0.5",
+    "shutter": "read-out of rows or columns one after another, within duration_ns. "
+    "world_from_camera and timestamp_ns are of its middle; start_from_camera and end_from_camera, "
+    "4x4, take points from the camera's axes then to those at the start and the end",
+    "depth": "uint16 PNG, metres x 256, 0 = none: along the optical axis, and with a lens of model "
+    "opencv_fisheye or ftheta along each pixel's ray",
 }
 
 
@@ -51,9 +70,26 @@ class CameraRecord:
     timestamp_ns: int
     """Time at which the image was taken."""
     K: torch.Tensor
-    """Intrinsics, float64 [3, 3], pixels."""
+    """Intrinsics, float64 [3, 3], pixels; with a lens, the numbers that its model takes."""
     world_from_camera: torch.Tensor
     """Pose in the dataset's world, float64 [4, 4]."""
+    lens: Lens | None = None
+    """Lens; None for a pinhole."""
+    shutter: RollingShutter | None = None
+    """Rolling shutter; None if all pixels are exposed at `timestamp_ns`."""
+
+    @property
+    def camera(self) -> Camera:
+        """Return the camera in the dataset's world."""
+        (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
+        return Camera(
+            self.name,
+            *(self.width, self.height, fx, fy, cx, cy),
+            camera_from_world=invert_rigid(self.world_from_camera),
+            timestamp_ns=self.timestamp_ns,
+            lens=self.lens,
+            shutter=self.shutter,
+        )
 
 
 def camera_record(camera: Camera, world_origin_m: np.ndarray) -> CameraRecord:
@@ -63,8 +99,10 @@ def camera_record(camera: Camera, world_origin_m: np.ndarray) -> CameraRecord:
         camera.width,
         camera.height,
         camera.timestamp_ns,
-        camera.K,
+        camera.without_lens().K,
         _in_dataset(camera.world_from_camera, world_origin_m),
+        camera.lens,
+        camera.shutter,
     )
 
 
@@ -79,12 +117,14 @@ def frame_entry(
     """
     cameras = {}
     for name in sorted(names):
-        record = camera_record(frame.cameras[name].scaled(scale), world_origin_m)
+        camera = frame.cameras[name].scaled(scale)
+        record = camera_record(camera, world_origin_m)
         (fx, _, cx), (_, fy, cy), _ = record.K.tolist()
         cameras[name] = {
             **{key: getattr(record, key) for key in ("timestamp_ns", "width", "height")},
             **{"fx": fx, "fy": fy, "cx": cx, "cy": cy},
             "world_from_camera": record.world_from_camera.tolist(),
+            **optics_record(camera),
         }
     return {
         "frame": frame.index,
@@ -98,12 +138,17 @@ def calibration_bytes(
     index: SceneIndex, variant: str, trajectory: str, entries: Mapping[int, Mapping[str, Any]]
 ) -> bytes:
     """Return the file's text, ordered by frame and camera; floats keep all their digits."""
+    has_lens = any(
+        "lens" in camera or "shutter" in camera
+        for entry in entries.values()
+        for camera in entry["cameras"].values()
+    )
     content = {
         "scene": index.name,
         "source": index.source,
         "variant": variant,
         "trajectory": trajectory,
-        "conventions": CONVENTIONS,
+        "conventions": CONVENTIONS | (LENS_CONVENTIONS if has_lens else {}),
         "has_metric_scale": index.has_metric_scale,
         "world_origin_m": index.world_origin_m.tolist(),
         "frames": [entries[number] for number in sorted(entries)],
@@ -136,6 +181,8 @@ def read_camera(entry: Mapping[str, Any], name: str) -> CameraRecord:
         checked_int(camera["timestamp_ns"]),
         torch.tensor(rows, dtype=torch.float64),
         torch.tensor(camera["world_from_camera"], dtype=torch.float64),
+        lens_of_record(camera["lens"]) if "lens" in camera else None,
+        shutter_of_record(camera["shutter"]) if "shutter" in camera else None,
     )
 
 
@@ -171,6 +218,7 @@ def trajectory_id(camera_path: Sequence[Frame] | None) -> str:
                 {
                     **{name: getattr(camera, name) for name in _CAMERA_NUMBERS},
                     "camera_from_world": camera.camera_from_world.tolist(),
+                    **optics_record(camera),
                 }
                 for camera in frame.cameras.values()
             ],

@@ -16,6 +16,8 @@ TRANSMITTANCE_STOP = 1e-4
 MAX_TRANSMITTANCE_STOP = 0.25
 # px^2 that are added to the diagonal of the projected covariance.
 COV2D_BLUR = 0.3
+# Largest blur, px^2, that margins of images allow for: views of a lens may be finer than its image.
+MAX_COV2D_BLUR = 1.2
 # Sigmas beyond which a splat is not drawn.
 MAX_EXTENT_SIGMAS = 3.33
 # Share of the image by which the range of the Jacobian's x/z and y/z exceeds the image.

@@ -30,7 +30,7 @@ from augment.render.buffers import (
     choose_kernels,
 )
 from augment.render.constants import (
-    COV2D_BLUR,
+    MAX_COV2D_BLUR,
     MAX_TRANSMITTANCE_STOP,
     TRANSMITTANCE_STOP,
     RasterSettings,
@@ -124,6 +124,7 @@ def rasterize(
         ValueError, TypeError: no backend, or not the named one, can take an argument.
         BackendUnavailable: the named backend cannot run on this machine.
     """
+    camera.check_no_lens("drawing splats")
     _check_arguments(parts, camera, buffers, settings)
     _check_devices(parts, backend)
     if fog is not None and camera.is_orthographic:
@@ -403,7 +404,7 @@ def _check_settings(settings: RasterSettings) -> None:
             f"left",
         ),
         "radius_clip_px": (0 <= s.radius_clip_px < math.inf, "finite and >= 0 (pixels)"),
-        "blur_px2": (0 < s.blur_px2 <= COV2D_BLUR, f"> 0 and at most {COV2D_BLUR} (px^2)"),
+        "blur_px2": (0 < s.blur_px2 <= MAX_COV2D_BLUR, f"> 0 and at most {MAX_COV2D_BLUR} (px^2)"),
         "fog_cut": (0 <= s.fog_cut <= max_stop, f">= 0 and at most {max_stop}"),
         "lod_px": (0 <= s.lod_px < math.inf, "finite and >= 0 (pixels)"),
         "sh_degree": (degree is None or 0 <= degree <= MAX_DEGREE, f"None or 0 to {MAX_DEGREE}"),

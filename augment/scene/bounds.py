@@ -30,8 +30,9 @@ from augment.scene.cameras import Camera
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.scene import Actor, Gaussians, Scene
 
-# Margin around the image, pixels: 1.9 of it is the blur, the rest float32's rounding of pixels.
-_BLUR_PX = 3.0
+# Margin around the image, pixels: 3.7 of it is the largest blur, the rest float32's rounding of
+# pixels.
+_BLUR_PX = 4.0
 # Rounding of a sum, as a part of all its terms: a hundred times float32's.
 _ROUNDING = 1e-5
 
@@ -152,6 +153,7 @@ def _half_spaces(camera: Camera, near_m: float) -> tuple[np.ndarray, np.ndarray,
     Returns:
         sides [5, 3], offsets [5] and reach [5].
     """
+    camera.check_no_lens("planes around its view")
     focal = np.array([camera.fx, camera.fy])
     centre = np.array([camera.cx, camera.cy])
     size = np.array([camera.width, camera.height], np.float64)

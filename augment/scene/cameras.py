@@ -1,4 +1,4 @@
-"""Pinhole and orthographic cameras, and the frames of a drive.
+"""Cameras (pinhole, with a lens, orthographic), and the frames of a drive.
 
 Adapters build `Camera` and `Frame`; every other module reads them. `check_lens` refuses intrinsics
 that effects and kernels are not made for.
@@ -19,6 +19,8 @@ from torch import Tensor
 
 from augment.errors import SceneError
 from augment.scene.geometry import invert_rigid
+from augment.scene.lenses import Intrinsics, Lens
+from augment.scene.shutter import RollingShutter
 
 # Field of view over the longer side of the image, at least (docs/stability.md).
 MIN_FIELD_OF_VIEW_DEG = 1.0
@@ -41,7 +43,9 @@ class Camera:
 
     A pinhole camera shows the point (x, y, z) at pixel (fx x / z + cx, fy y / z + cy). An
     orthographic one, whose rays are parallel, shows it at (fx x + cx, fy y + cy). For both, depth
-    is z.
+    is z. A camera with a lens shows it where the lens says (`augment.scene.lenses`); its depth is z
+    or the distance along the ray, as the lens says. Code for pinhole cameras refuses the others:
+    `augment.view.lens_view` draws pinhole views and brings their pictures to the lens's pixels.
     """
 
     name: str
@@ -65,6 +69,11 @@ class Camera:
     is_orthographic: bool = False
     """If True, rays are parallel, for maps seen from above; weather, labels and training know
     pinhole cameras only."""
+    lens: Lens | None = None
+    """Lens in front of the image; None for a pinhole."""
+    shutter: RollingShutter | None = None
+    """Read-out of the rows while the camera moves; None if all are exposed at `timestamp_ns`. With
+    a shutter, pose and timestamp are those of the middle of the read-out."""
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
@@ -85,6 +94,11 @@ class Camera:
                 f"camera {self.name!r}: camera_from_world must be float64 [4, 4]; "
                 f"got {pose.dtype} {list(pose.shape)}"
             )
+        if self.is_orthographic and (self.lens is not None or self.shutter is not None):
+            raise ValueError(
+                f"camera {self.name!r}: an orthographic camera has neither lens nor shutter; "
+                f"got {self.lens} and {self.shutter}"
+            )
         # In numpy: every view of a frame is checked, and torch takes ten times as long for it.
         rotation = pose.detach().numpy()[:3, :3]
         with np.errstate(invalid="ignore"):
@@ -96,6 +110,16 @@ class Camera:
                 f"its rotation is off orthonormal by {error:.3g}, "
                 f"determinant {determinant:.3g}"
             )
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Return focal lengths and principal point, pixels, as lenses take them."""
+        return Intrinsics(self.fx, self.fy, self.cx, self.cy)
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Return True for a camera that the rasteriser can draw in perspective as it is."""
+        return not self.is_orthographic and self.lens is None and self.shutter is None
 
     @property
     def K(self) -> Float[Tensor, "3 3"]:
@@ -150,8 +174,33 @@ class Camera:
             width: width of the window, pixels.
             height: height of the window, pixels.
         """
+        shutter = self.shutter
+        if shutter is not None:
+            shutter = shutter.cropped(left, top, (width, height), (self.width, self.height))
         return dataclasses.replace(
-            self, width=width, height=height, cx=self.cx - left, cy=self.cy - top
+            self, width=width, height=height, cx=self.cx - left, cy=self.cy - top, shutter=shutter
+        )
+
+    def without_lens(self) -> Camera:
+        """Return the pinhole camera with the same pose and intrinsics: no lens, no shutter."""
+        if self.lens is None and self.shutter is None:
+            return self
+        return dataclasses.replace(self, lens=None, shutter=None)
+
+    def at_read_out(self, share: float) -> Camera:
+        """Return the camera, without its shutter, at a share of the read-out.
+
+        Args:
+            share: 0 at the start, 0.5 at the middle, 1 at the end.
+        """
+        shutter = self.shutter
+        if shutter is None:
+            return self
+        return dataclasses.replace(
+            self,
+            camera_from_world=shutter.camera_at(share, self.camera_from_world),
+            timestamp_ns=self.timestamp_ns + shutter.time_at_ns(share),
+            shutter=None,
         )
 
     def ray_directions(
@@ -168,7 +217,7 @@ class Camera:
             device: device of the result; None for the CPU.
 
         Raises:
-            ValueError: the camera is orthographic.
+            ValueError: the camera is no pinhole.
         """
         self._check_pinhole("rays of its own at every pixel")
         u, v = self._slopes(device)
@@ -188,7 +237,7 @@ class Camera:
             device: device of the result; None for the CPU.
 
         Raises:
-            ValueError: the camera is orthographic.
+            ValueError: the camera is no pinhole.
         """
         self._check_pinhole("ray lengths that differ")
         u, v = self._slopes(device)
@@ -204,8 +253,27 @@ class Camera:
         """Return the unit of an intrinsic number."""
         return "pixels per metre" if self.is_orthographic and name[0] == "f" else "pixels"
 
+    def check_no_lens(self, purpose: str) -> None:
+        """Refuse a camera with a lens or a shutter, for code that draws with straight rays only.
+
+        Args:
+            purpose: ends the sentence "has a lens and cannot be used for ...".
+
+        Raises:
+            ValueError: the camera has a lens or a shutter.
+        """
+        if self.lens is None and self.shutter is None:
+            return
+        part = "a rolling shutter" if self.lens is None else f"a lens ({type(self.lens).__name__})"
+        raise ValueError(
+            f"camera {self.name!r} has {part} and cannot be used for {purpose}; expected a camera "
+            "without lens and shutter. Draw its pinhole views (augment.view.lens_view does so for "
+            "views in weather), or take camera.without_lens() where the distortion does not matter"
+        )
+
     def _check_pinhole(self, property_name: str) -> None:
-        """Raise ValueError if the camera is orthographic."""
+        """Raise ValueError if the camera is orthographic, or has a lens or a shutter."""
+        self.check_no_lens(f"{property_name} of a pinhole camera")
         if self.is_orthographic:
             raise ValueError(
                 f"camera {self.name!r} is orthographic and has not {property_name}: its rays are "

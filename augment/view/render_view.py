@@ -12,7 +12,7 @@ from __future__ import annotations
 import sys
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -28,15 +28,16 @@ from augment.light.common_exposure import added_colors
 from augment.light.sky_gloss import GreyedGloss, find_sky_gloss
 from augment.output.layout import TRUST
 from augment.photo.greyed_photo import SMALL_PX, grey_photo
+from augment.photo.lens_photo import open_lens_photo, scene_colors, transfer_change
 from augment.photo.own_car import OwnCar, own_car_in_view
 from augment.photo.own_car_snow import cover_own_car
 from augment.photo.parked_objects import ObjectBox, ParkedObjects
 from augment.photo.photo_objects import copy_size
-from augment.photo.recorded_base import mix, open_photo, splat_classes
+from augment.photo.recorded_base import PhotoView, mix, open_photo, splat_classes
 from augment.photo.trust import trust_mask
 from augment.render.backends import choose_backend, renders_on_gpu
 from augment.render.buffers import AUTO, CPU, EXPECTED_DEPTH, SPLAT_IDS, RenderOutput
-from augment.render.composite import apply_color_map
+from augment.render.composite import apply_color_map, to_bytes
 from augment.render.constants import SURFACE_ALPHA
 from augment.render.rasterize import rasterize
 from augment.render.sensor import add_noise, blur_lens
@@ -44,11 +45,13 @@ from augment.render.threads import num_concurrent_views, split_threads, wait_for
 from augment.rng import rng_for
 from augment.scene.cameras import Camera
 from augment.scene.labels import EGO_VEHICLE
+from augment.scene.pinhole_scene import pinhole_scene
 from augment.scene.scene import Gaussians, PosedGaussians, Scene
 from augment.timing import timed
 from augment.view.box_labels import OWN_CAR_DEPTH_M
 from augment.view.images import ViewImages, start_images
 from augment.view.layers import LayerRenderer
+from augment.view.lens_view import ViewPicture, draw_through_lens
 from augment.view.plan import (
     BARE_SURFACE_PASS,
     GLOSS_PASS,
@@ -90,13 +93,18 @@ def begin_view(scene: Scene, camera: Camera, recipe: Recipe, *, backend: str = A
     """Begin the view of `render_view`; its `result` waits for the GPU.
 
     Another view can be begun before this one's result is asked for. The arguments are those of
-    `render_view`.
+    `render_view`. The view of a camera with a lens or a rolling shutter is finished here.
     """
+    scene = pinhole_scene(scene)
     if backend == AUTO:
         backend = choose_backend(backend, scene)
     with timed("plan"):
         recipe, plan = plan_at(recipe, scene, camera.timestamp_ns)
-    buffers = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
+    camera = camera.scaled(recipe.render.scale)
+    if not (camera.is_pinhole or camera.is_orthographic):
+        finished_view = _render_lens_view(scene, camera, plan, recipe, backend)
+        return PendingView(lambda: finished_view)
+    buffers = render_buffers(scene, camera, plan, backend=backend)
     images = start_images(buffers, plan)
     # The closure below holds the camera and not the buffers, which the images may long outlive.
     camera = buffers.camera
@@ -121,9 +129,50 @@ def render_buffers(
 
     Args:
         scene: the scene.
-        camera: the view, at the resolution to render.
+        camera: the view, at the resolution to render; without lens and rolling shutter.
         plan: the passes that the recipe requires (`augment.view.plan.plan_at`).
         backend: as for `rasterize`.
+    """
+    drawing = _draw_scene(scene, camera, plan, backend=backend)
+    return _expose(scene, camera, plan, drawing, backend=backend)
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawing:
+    """A picture before the camera's sensor."""
+
+    view: ViewPlan
+    """Plan of the view."""
+    rendered: RenderedView
+    """The picture."""
+    color_map: Tensor | None
+    """Colour map that the finished picture gets, [3, 4]; None without one."""
+    parts: tuple[PosedGaussians, ...]
+    """The parts of the scene with what lies on them."""
+    bare_parts: tuple[PosedGaussians, ...]
+    """The parts of the scene alone."""
+    own_car: OwnCar | None
+    """The recording car in a recorded image; None where there is none."""
+
+
+def _draw_scene(
+    scene: Scene,
+    camera: Camera,
+    plan: Plan,
+    *,
+    backend: str,
+    is_behind_lens: bool = True,
+    photo_view: PhotoView | None = None,
+) -> _Drawing:
+    """Return the picture of a view before the camera's sensor.
+
+    Args:
+        scene: the scene.
+        camera: the view.
+        plan: the plan of all views.
+        backend: as for `rasterize`.
+        is_behind_lens: if False, effects on the glass before the lens are left out.
+        photo_view: the recorded image in this view of it; None if the image is the camera's own.
     """
     with timed("view plan"):
         view = plan_view(plan, scene, camera, backend=backend)
@@ -145,7 +194,9 @@ def render_buffers(
             finds_sky = plan.depth_buffer is not None or any(
                 not effect.hooks.adds_overlays for effect in view.effects
             )
-            photo = open_photo(scene, camera, color_map, backend=backend, finds_sky=finds_sky)
+            photo = open_photo(
+                scene, camera, color_map, backend=backend, finds_sky=finds_sky, view=photo_view
+            )
     layers = LayerRenderer(bare_parts, scene.sky, None, False, plan.settings, backend, photo)
     if photo is not None:
         layers = replace(layers, parked=partial(_parked_objects, scene, bare_parts[0].gaussians))
@@ -167,8 +218,9 @@ def render_buffers(
         # In the colours of a style, and with the gloss that it was recorded with.
         car_rgb = replace(layers.photo, pixels=photo.pixels).own_car_colors(own_car.rows)
     rendered = _draw(view, layers, camera)
+    picture_effects = [e for e in view.effects if is_behind_lens or not is_on_glass(e)]
     if own_car is None or car_rgb is None:
-        for effect in view.effects:
+        for effect in picture_effects:
             rendered = _edit_image(view, effect, rendered, camera, color_map)
     else:
         if plan.covers_own_car:
@@ -176,7 +228,64 @@ def render_buffers(
                 seed=plan.seed, scene=scene.name, effect="snow on the own car", camera=camera.name
             )
             car_rgb = cover_own_car(car_rgb, own_car, rendered.raster, rng=rng)
-        rendered = _edit_around_own_car(view, rendered, camera, own_car, car_rgb, color_map)
+        rendered = _edit_around_own_car(
+            view, picture_effects, rendered, camera, own_car, car_rgb, color_map
+        )
+    return _Drawing(view, rendered, color_map, tuple(layers.parts), bare_parts, own_car)
+
+
+def _expose(
+    scene: Scene, camera: Camera, plan: Plan, drawing: _Drawing, *, backend: str
+) -> WeatheredBuffers:
+    """Return the buffers of a view whose picture has been drawn, as the sensor records it.
+
+    Args:
+        scene: the scene.
+        camera: the view.
+        plan: the plan of all views.
+        drawing: the picture.
+        backend: as for `rasterize`.
+    """
+    view = drawing.view
+    rendered = _record_picture(
+        scene, camera, plan, view, drawing.rendered, drawing.color_map, backend
+    )
+    with timed("depth of surfaces"):
+        depth_m = _surface_depth(rendered.raster, plan, plan.image_buffers)
+    return WeatheredBuffers(
+        camera=camera,
+        rgb=rendered.rgb,
+        raster=rendered.raster,
+        depth_m=depth_m,
+        parts=drawing.parts,
+        plan=view.skip_steps(rendered.skip_reasons),
+        masks=_masks(view, rendered, drawing.own_car),
+        bare_buffers=_bare(rendered.raster, drawing.bare_parts, camera, plan, view, backend),
+        luminance_cd_m2=rendered.luminance_cd_m2,
+    )
+
+
+def _record_picture(
+    scene: Scene,
+    camera: Camera,
+    plan: Plan,
+    view: ViewPlan,
+    drawn: RenderedView,
+    color_map: Tensor | None,
+    backend: str,
+) -> RenderedView:
+    """Return a picture after the camera's colours, its lens's blur and its sensor.
+
+    Args:
+        scene: the scene.
+        camera: the view.
+        plan: the plan of all views.
+        view: the plan of this view.
+        drawn: the picture.
+        color_map: the camera's colour map, [3, 4]; None without one.
+        backend: as for `rasterize`.
+    """
+    rendered = drawn
     rgb = rendered.rgb
     # A camera exposes what the weather has left, so this comes last if no effect needs it before.
     if color_map is not None and _first_exposed(view) is None:
@@ -196,19 +305,128 @@ def render_buffers(
             rgb = add_noise(
                 rgb, noise_sigma, camera, seed=noise_seed, scene=scene.name, backend=backend
             )
-    with timed("depth of surfaces"):
-        depth_m = _surface_depth(rendered.raster, plan, plan.image_buffers)
-    return WeatheredBuffers(
-        camera=camera,
-        rgb=rgb,
-        raster=rendered.raster,
-        depth_m=depth_m,
-        parts=tuple(layers.parts),
-        plan=view.skip_steps(rendered.skip_reasons),
-        masks=_masks(view, rendered, own_car),
-        bare_buffers=_bare(rendered.raster, bare_parts, camera, plan, view, backend),
-        luminance_cd_m2=rendered.luminance_cd_m2,
+    return replace(rendered, rgb=rgb)
+
+
+def _render_lens_view(
+    scene: Scene, camera: Camera, plan: Plan, recipe: Recipe, backend: str
+) -> WeatheredView:
+    """Return the finished view of a camera with a lens or a rolling shutter.
+
+    Pinhole views are drawn and put together. Then come the effects on the glass before the lens,
+    the lens's blur and the sensor, once for the whole picture.
+
+    Args:
+        scene: the scene, with pinhole cameras.
+        camera: the view, at the resolution to render.
+        plan: the plan of all views.
+        recipe: the recipe at the moment of the view.
+        backend: as for `rasterize`.
+    """
+    drawings = list[_Drawing]()
+    lens_photo = None
+    if plan.is_on_photo:
+        with timed("photo"):
+            lens_photo = open_lens_photo(scene, camera)
+
+    def draw(view_camera: Camera, blur_gain: float, lens_camera: Camera) -> ViewPicture:
+        photo_view = None
+        photo_rgb = None
+        if lens_photo is not None:
+            with timed("photo"):
+                photo_view = PhotoView(
+                    lens_photo.pixels_in(lens_camera, view_camera), lens_photo.frame, lens_camera
+                )
+                color_map = scene.color_map(camera) if plan.uses_recorded_exposure else None
+                photo_rgb = scene_colors(photo_view.pixels, color_map)
+        blur_px2 = plan.settings.blur_px2 * blur_gain
+        plan_of_view = replace(plan, settings=replace(plan.settings, blur_px2=blur_px2))
+        drawing = _draw_scene(
+            scene,
+            view_camera,
+            plan_of_view,
+            backend=backend,
+            is_behind_lens=False,
+            photo_view=photo_view,
+        )
+        drawings.append(drawing)
+        rendered = drawing.rendered
+        raster = rendered.raster
+        buffers = WeatheredBuffers(
+            camera=view_camera,
+            rgb=rendered.rgb,
+            raster=raster,
+            depth_m=_surface_depth(raster, plan, plan.image_buffers),
+            parts=drawing.parts,
+            plan=drawing.view,
+            masks=_masks(drawing.view, rendered, drawing.own_car),
+            bare_buffers=_bare(
+                raster, drawing.bare_parts, view_camera, plan, drawing.view, backend
+            ),
+        )
+        has_trust = recipe.output.trust
+        own_car = own_car_in_view(scene, view_camera) if plan.is_on_photo else None
+        return ViewPicture(
+            rendered.rgb.detach().float().cpu().numpy(),
+            start_images(buffers, plan)(),
+            trust=trust_mask(scene, view_camera, backend=backend) if has_trust else None,
+            own_car=None if own_car is None else own_car.mask,
+            photo_rgb=photo_rgb,
+        )
+
+    picture = draw_through_lens(camera, recipe.render.shutter_strips, draw)
+    names = {effect.hooks.name for drawing in drawings for effect in drawing.view.effects}
+    first = drawings[0]
+    effects_in_view = tuple(
+        next(
+            effect
+            for drawing in drawings
+            for effect in drawing.view.effects
+            if effect.hooks.name == name
+        )
+        for name in (effect.name for effect in effects.EFFECTS)
+        if name in names
     )
+    view = replace(first.view, effects=effects_in_view)
+    image_camera = camera.without_lens()
+    masks = {name: torch.from_numpy(mask) > 0 for name, mask in picture.images.masks.items()}
+    picture_rgb = picture.rgb
+    if lens_photo is not None and picture.photo_rgb is not None:
+        with timed("photo"):
+            recorded_rgb = scene_colors(lens_photo.pixels, first.color_map)
+            picture_rgb = transfer_change(picture_rgb, picture.photo_rgb, recorded_rgb)
+    rendered = RenderedView(
+        torch.from_numpy(picture_rgb), RenderOutput(), first.rendered.layers, masks=masks
+    )
+    glass_effects = [effect for effect in view.effects if is_on_glass(effect)]
+    for effect in glass_effects:
+        rendered = _edit_image(view, effect, rendered, image_camera, first.color_map)
+    rendered = _record_picture(scene, image_camera, plan, view, rendered, first.color_map, backend)
+    rgb = rendered.rgb.detach()
+    if picture.is_inside is not None and lens_photo is None:
+        rgb = torch.where(torch.from_numpy(picture.is_inside)[..., None], rgb, 0.0)
+    luminance = rendered.luminance_cd_m2
+    images = replace(
+        picture.images,
+        rgb=to_bytes(rgb).cpu().numpy(),
+        masks={
+            name: np.where(mask.cpu().numpy(), np.uint8(255), np.uint8(0))
+            for name, mask in rendered.masks.items()
+        },
+        luminance_cd_m2=None if luminance is None else luminance.float().cpu().numpy(),
+    )
+    own_car = picture.own_car
+    car = None if own_car is None else OwnCar(own_car, slice(0, 0), np.zeros((0, camera.width)))
+    trust = {} if picture.trust is None else {TRUST: picture.trust}
+    if own_car is not None:
+        trust = {name: np.where(own_car, np.uint8(0), mask) for name, mask in trust.items()}
+    active = {effect.hooks.name: effect for effect in plan.active_effects(scene, backend=backend)}
+    return _weathered(images, camera, plan, recipe, active, trust, car)
+
+
+def is_on_glass(effect: EffectInScene) -> bool:
+    """Return True if the effect lies on the glass before the lens, and so on the whole image."""
+    return effect.hooks.section.startswith("camera.")
 
 
 def _parked_objects(scene: Scene, background: Gaussians) -> ParkedObjects:
@@ -352,6 +570,7 @@ def _edit_image(
 
 def _edit_around_own_car(
     view: ViewPlan,
+    picture_effects: Sequence[EffectInScene],
     first_view: RenderedView,
     camera: Camera,
     own_car: OwnCar,
@@ -365,6 +584,7 @@ def _edit_around_own_car(
 
     Args:
         view: the plan of the view.
+        picture_effects: effects that edit the picture.
         first_view: the picture before `edit_image` of the effects.
         camera: the view.
         own_car: the recording car in it.
@@ -373,7 +593,7 @@ def _edit_around_own_car(
     """
     rendered = first_view
     is_car_covered = True
-    for effect in view.effects:
+    for effect in picture_effects:
         is_weather = _is_weather(effect)
         if is_car_covered and (not is_weather or effect.hooks.reads_neighbours(effect)):
             rendered = _with_own_car(rendered, first_view, own_car, car_rgb)

@@ -137,6 +137,71 @@ def write_as_kitti(day: Path, *, frames: int = FRAMES, cameras=("02", "03")) -> 
     return drive
 
 
+# The release before synchronisation and rectification: lenses, OpenCV's pixel coordinates, and the
+# cameras' places by R and T. Image n + 2 is taken 30 ms after sweep n.
+LENS_SIZE = (176, 80)
+LENS_K = np.array([[125.0, 0, 87.3], [0, 124.6, 36.8], [0, 0, 1]])
+LENS_D = np.array([-0.37, 0.2, 0.0014, 0.0006, -0.068])
+UNRECTIFIED_FROM_CAMERA_0 = rigid(turn(1, 0.02) @ turn(0, -0.004), [0.059, -0.0001, -0.0074])
+IMAGE_OFFSET_MS = 30
+IMAGE_LEAD = 2
+
+
+def unrectified_from_velo() -> np.ndarray:
+    return UNRECTIFIED_FROM_CAMERA_0 @ VELO_TO_CAM
+
+
+def unrectified_picture(moment: float) -> np.ndarray:
+    """The street through the lens at a frame number that may lie between frames, BGR uint8."""
+    width, height = LENS_SIZE
+    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    pixels = np.stack([u, v], -1).reshape(-1, 1, 2)
+    criteria = (cv2.TERM_CRITERIA_COUNT, 200, 0.0)
+    xy = cv2.undistortPoints(pixels, LENS_K, LENS_D, criteria=criteria).reshape(height, width, 2)
+    street_from_camera = street_from_velo(moment) @ np.linalg.inv(unrectified_from_velo())
+    rays = np.concatenate([xy, np.ones_like(xy[..., :1])], -1) @ street_from_camera[:3, :3].T
+    image = colour_at(street_from_camera[:3, 3], rays, moment)
+    return np.ascontiguousarray(image[..., ::-1].astype(np.uint8))
+
+
+def write_as_kitti_extract(day: Path, *, frames: int = FRAMES) -> Path:
+    """Write a day's folder with calibration and one drive before synchronisation."""
+    drive = day / "2011_09_26_drive_0001_extract"
+    write_calibration(day)
+    lens_lines = [
+        f"K_02: {_words(LENS_K)}",
+        f"D_02: {_words(LENS_D)}",
+        f"R_02: {_words(UNRECTIFIED_FROM_CAMERA_0[:3, :3])}",
+        f"T_02: {_words(UNRECTIFIED_FROM_CAMERA_0[:3, 3])}",
+    ]
+    path = day / "calib_cam_to_cam.txt"
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("S_02")]
+    _text(path, [*lines, f"S_02: {LENS_SIZE[0]:e} {LENS_SIZE[1]:e}", *lens_lines])
+    for number in range(frames + IMAGE_LEAD):
+        moment = number - IMAGE_LEAD + IMAGE_OFFSET_MS / 100
+        _image(drive / f"image_02/data/{number:010d}.png", unrectified_picture(moment))
+    image_ms = [100 * (n - IMAGE_LEAD) + IMAGE_OFFSET_MS for n in range(frames + IMAGE_LEAD)]
+    _text(drive / "image_02/timestamps.txt", [_time_text(ms) for ms in image_ms])
+    for frame in range(frames):
+        points = points_at(frame)
+        pose = street_from_velo(frame)
+        sensor = (points - pose[:3, 3]) @ pose[:3, :3]
+        rows = np.column_stack([sensor, np.linspace(0, 0.99, len(points))])
+        text = [" ".join(f"{value:.6f}" for value in row) for row in rows]
+        _text(drive / f"velodyne_points/data/{frame:010d}.txt", text)
+    _text(drive / "velodyne_points/timestamps.txt", [_time_text(100 * f) for f in range(frames)])
+    packet_ms = range(0, 100 * frames + 100, 50)  # the first one's latitude gives the world's scale
+    for number, ms in enumerate(packet_ms):
+        write_oxts(drive, number, moment=ms / 100)
+    _text(drive / "oxts/timestamps.txt", [_time_text(ms) for ms in packet_ms])
+    return drive
+
+
+def _time_text(milliseconds: int) -> str:
+    seconds = 25 + milliseconds / 1000
+    return f"{START[:-2]}{seconds:012.9f}"
+
+
 def drive_of_kitti(root: Path) -> Drive:
     world = world_from_street()
     times_ns = {n: START_NS + 100_000_001 * n for n in range(FRAMES)}
@@ -214,9 +279,11 @@ def write_sweep(path: Path, street_from_sensor: np.ndarray, frame: int) -> None:
     path.write_bytes(np.column_stack([sensor, reflectance]).astype("<f4").tobytes())
 
 
-def write_oxts(drive: Path, frame: int, **replaced: float) -> None:
+def write_oxts(drive: Path, frame: int, moment: float | None = None, **replaced: float) -> None:
+    """Write a packet. moment: frame number at its time; None for that of its own number."""
     scale = np.cos(LATITUDE * np.pi / 180) * EARTH_M
-    x, y, z = (world_from_street() @ np.append(imu_position(frame), 1))[:3]
+    position = imu_position(frame if moment is None else moment)
+    x, y, z = (world_from_street() @ np.append(position, 1))[:3]
     values = {
         "latitude": np.degrees(2 * np.arctan(np.exp(y / scale)) - np.pi / 2),
         "longitude": np.degrees(x / scale),

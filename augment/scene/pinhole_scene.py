@@ -1,0 +1,73 @@
+"""Scenes whose cameras have lenses, with pinhole cameras that look the same way in their place.
+
+Placement of snow and wet ground, trust, pruning and photos ask where cameras have been and what
+they have seen. They know straight rays only.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from weakref import WeakKeyDictionary
+
+from augment.memo import share_memo
+from augment.scene.cameras import Frame
+from augment.scene.pinhole_views import covering_camera
+from augment.scene.scene import Scene
+
+
+def pinhole_scene(scene: Scene) -> Scene:
+    """Return the scene with a pinhole camera in place of each camera with a lens or a shutter.
+
+    The result is the scene itself if all its cameras are pinholes. Otherwise it is made once, and
+    shares the scene's memo, since nothing is computed with the cameras as they are. Where actors
+    were moved, the scene as it was recorded has the same pinhole cameras.
+    """
+    recorded = None if scene.recorded is None else pinhole_scene(scene.recorded)
+    with _lock:
+        known = _scenes.get(scene)
+        if known is not None:
+            return known
+        if recorded is not None and scene.recorded and scene.frames is scene.recorded.frames:
+            frames = recorded.frames
+        else:
+            frames = _pinhole_frames(scene.frames)
+        seen_frames = None if scene.seen_frames is None else _pinhole_frames(scene.seen_frames)
+        if frames is scene.frames and seen_frames is scene.seen_frames:
+            return scene
+        changed = dataclasses.replace(
+            scene,
+            frames=frames,
+            seen_frames=seen_frames,
+            lens_frames=scene.frames,
+            recorded=recorded,
+        )
+        share_memo(scene, changed)
+        _scenes[scene] = changed
+        return changed
+
+
+# Scenes with pinhole cameras, by the scene with lenses. Not in the memo that both share: it would
+# keep them for ever.
+_scenes: WeakKeyDictionary[Scene, Scene] = WeakKeyDictionary()
+_lock = threading.Lock()
+
+
+def _pinhole_frames(frames: tuple[Frame, ...]) -> tuple[Frame, ...]:
+    """Return frames with pinhole cameras; the same tuple if they have no others."""
+    if all(
+        camera.is_pinhole or camera.is_orthographic
+        for frame in frames
+        for camera in frame.cameras.values()
+    ):
+        return frames
+    return tuple(
+        dataclasses.replace(
+            frame,
+            cameras={
+                name: camera if camera.is_orthographic else covering_camera(camera)
+                for name, camera in frame.cameras.items()
+            },
+        )
+        for frame in frames
+    )

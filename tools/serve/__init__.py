@@ -1,0 +1,1 @@
+"""`climategs serve`: a renderer for closed-loop simulators over gRPC (docs/simulator.md)."""
