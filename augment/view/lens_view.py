@@ -199,7 +199,7 @@ class _Lookup:
         return out
 
     def depth(
-        self, images: Sequence[Float32[np.ndarray, "h w"] | None], is_along_ray: bool
+        self, images: Sequence[Float32[np.ndarray, "_ _"] | None], is_along_ray: bool
     ) -> Float32[np.ndarray, "H W"] | None:
         """Return the depth at the lens's pixels, 0 where there is none.
 
@@ -233,7 +233,7 @@ def _join(
         size: height and width of the whole image.
     """
 
-    def join(images: Sequence[np.ndarray | None], value: float = 0) -> np.ndarray | None:
+    def join(images: Sequence[np.ndarray | None], value: int = 0) -> np.ndarray | None:
         first = next((image for image in images if image is not None), None)
         if first is None:
             return None
