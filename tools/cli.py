@@ -396,6 +396,8 @@ class RecordOptions(Command):
             recording has no metres.
         positions: A CSV table with the columns image, lat, lon, or image, x, y in metres: where
             images were taken. It also turns the recording's x to the east.
+        lens: recorded keeps the images as they are, and their lens in calibration.json; undistorted
+            takes the distortion out of them.
     """
 
     model: Positional[Path]
@@ -404,6 +406,7 @@ class RecordOptions(Command):
     fps: Annotated[float, Field(gt=0, le=1000)]
     camera_height: Annotated[float, Field(gt=0.05, le=20)] | None = None
     positions: Path | None = None
+    lens: Literal["undistorted", "recorded"] = "undistorted"
 
     def run(self) -> int:
         from tools.record import record_drive

@@ -44,14 +44,15 @@ def project_edges(
     a = corners_m[:, edges[:, 0], None, :]
     b = corners_m[:, edges[:, 1], None, :]
     points = a + share * (b - a)  # [B, 12, P + 1, 3]
+    num_segments = points.shape[1] * (points.shape[2] - 1)
     pixels, is_shown = project_points(camera, points.reshape(-1, 3))
     pixels = np.where(is_shown[:, None], pixels, 0.0).reshape((*points.shape[:-1], 2))
     is_shown = is_shown.reshape(points.shape[:-1])
     num_boxes = len(corners_m)
     return EdgePieces(
-        pixels[:, :, :-1].reshape(num_boxes, -1, 2),
-        pixels[:, :, 1:].reshape(num_boxes, -1, 2),
-        (is_shown[:, :, :-1] & is_shown[:, :, 1:]).reshape(num_boxes, -1),
+        pixels[:, :, :-1].reshape(num_boxes, num_segments, 2),
+        pixels[:, :, 1:].reshape(num_boxes, num_segments, 2),
+        (is_shown[:, :, :-1] & is_shown[:, :, 1:]).reshape(num_boxes, num_segments),
     )
 
 

@@ -30,7 +30,9 @@ def pinhole_scene(scene: Scene) -> Scene:
         seen_frames = None if scene.seen_frames is None else _pinhole_frames(scene.seen_frames)
         if frames is scene.frames and seen_frames is scene.seen_frames:
             return scene
-        changed = dataclasses.replace(scene, frames=frames, seen_frames=seen_frames)
+        changed = dataclasses.replace(
+            scene, frames=frames, seen_frames=seen_frames, lens_frames=scene.frames
+        )
         share_memo(scene, changed)
         _scenes[scene] = changed
         return changed

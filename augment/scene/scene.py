@@ -563,6 +563,9 @@ class Scene:
     seen_frames: tuple[Frame, ...] | None = None
     """Frames that the scene was made from, where `frames` are others (those of a camera path, or
     invented ones); empty where they are not known, None where they are `frames`."""
+    lens_frames: tuple[Frame, ...] | None = None
+    """The frames with their lenses, where `frames` have pinholes in their place
+    (`augment.scene.pinhole_scene`); else None."""
     ego_masks: Mapping[str, Bool[np.ndarray, "_ _"]] | None = None
     """Pixels of recorded images that show the recording car, by camera name, bool [H, W] at the
     size of the camera's images. A camera without a mask shows none of it; None where no masks are
