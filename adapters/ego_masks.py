@@ -28,6 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from adapters.plain_files import Number, decode_image, read_json, validate_content
 from adapters.uri import EGO_MASKS_KEY, add_to_uri
 from augment.errors import AdapterError
+from augment.files.undistorted_images import undistort
 from augment.scene.cameras import Camera
 from augment.scene.scene import Scene
 from recipes.errors import nearest_word
@@ -76,9 +77,27 @@ def with_ego_masks(scene: Scene, folder: Path) -> Scene:
             f"{EGO_MASKS_KEY}={folder}: scene {scene.name!r} ({scene.source}) has no cameras, so "
             f"there is nothing to mask"
         )
-    masks = read_ego_masks(folder, cameras)
+    masks = {
+        name: _undistorted(scene, mask, cameras[name])
+        for name, mask in read_ego_masks(folder, cameras).items()
+    }
     source = add_to_uri(scene.source, EGO_MASKS_KEY, str(folder.absolute()))
     return dataclasses.replace(scene, ego_masks=masks, source=source)
+
+
+def _undistorted(scene: Scene, mask: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return a mask of recorded images as the undistorted copies of these have it.
+
+    Args:
+        scene: the scene.
+        mask: bool [H, W], of the images as they were recorded.
+        camera: the camera of these images.
+    """
+    copies = (f.cameras[camera.name] for f in scene.seen_frames or () if camera.name in f.cameras)
+    pinhole = next((copy for copy in copies if copy.is_pinhole), None)
+    if camera.lens is None or pinhole is None:
+        return mask
+    return undistort(mask.astype(np.uint8) * 255, camera, pinhole) >= _WHITE_LEVEL
 
 
 def read_ego_masks(

@@ -43,6 +43,13 @@ from adapters.camera_files.paths import (
     road_heights,
     solid_points,
 )
+from adapters.recorded_lenses import (
+    LENS_MEANING,
+    RECORDED_LENS,
+    UNDISTORTED_LENS,
+    LensChoice,
+    split_lenses,
+)
 from adapters.uri import UriOptions, format_uri
 from adapters.world import WorldChange, nearest_axis, parse_up, rotation_to_z_up
 from augment.errors import AdapterError
@@ -112,6 +119,7 @@ class GaussianOptions(UriOptions):
         description="of a .ply: true if it stores opacities from 0 to 1 and scales as lengths, "
         "false if it stores logits and logarithms, as trainers do; told by the values, or asked",
     )
+    lens: LensChoice = Field(UNDISTORTED_LENS, description=LENS_MEANING)
     sky: Annotated[tuple[Part, Part, Part], BeforeValidator(_colour)] | None = Field(
         None,
         description="the colour behind the Gaussians: overcast (a light grey), black, white, or "
@@ -404,8 +412,16 @@ def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
     change = world.change
     gaussians = change.gaussians(splats.gaussians, splats.origin)
     frames, ground_z_m, about_frames = _frames_and_ground(gaussians, views, world, options)
+    name = _scene_name(files, Path(path))
+    seen_frames = None if views else ()
+    if options.lens == RECORDED_LENS:
+        cameras = "cameras of the scene's file" if views else "cameras of a made-up path"
+        lens_frames = split_lenses(name, frames, options.lens, published=cameras)
+        problems += lens_frames.notes
+        if lens_frames.recorded_frames is not None:
+            seen_frames = lens_frames.frames
     return Scene(
-        name=_scene_name(files, Path(path)),
+        name=name,
         source=format_uri("gaussians", path, query),
         background=gaussians,
         actors=(),
@@ -415,7 +431,7 @@ def open_gaussians(path: str | Path, query: dict[str, str]) -> Scene:
         ground_z_m=ground_z_m,
         has_metric_scale=world.is_metric,
         has_known_gravity=world.knows_up,
-        seen_frames=None if views else (),
+        seen_frames=seen_frames,
         problems=(*problems, *world.problems, *about_frames),
     )
 
@@ -544,7 +560,7 @@ def _find_views(file: Path, path: Path, options: GaussianOptions) -> ViewSet | N
     if options.cameras == "none":
         return None
     if options.cameras is not None:
-        return read_views(Path(options.cameras))
+        return read_views(Path(options.cameras), has_lenses=options.lens == RECORDED_LENS)
     folders = [file.parent]
     if _ITERATION.fullmatch(file.parent.name) and file.parent.parent.name == "point_cloud":
         folders.append(file.parent.parent.parent)
@@ -553,7 +569,7 @@ def _find_views(file: Path, path: Path, options: GaussianOptions) -> ViewSet | N
     for folder in folders:
         if camera_file := find_camera_file(folder):
             try:
-                return read_views(camera_file)
+                return read_views(camera_file, has_lenses=options.lens == RECORDED_LENS)
             except AdapterError as error:
                 raise AdapterError(
                     f"{error}. (Found beside {file}; give cameras=FILE for others or cameras=none "

@@ -40,6 +40,44 @@ def with_recorded_frames(scene: Scene, recorded_frames: tuple[Frame, ...] | None
     return dataclasses.replace(scene, frames=recorded_frames, seen_frames=scene.frames)
 
 
+def undistorted_scene(scene: Scene) -> Scene:
+    """Return the scene with the undistorted images that it was made from, and their pinholes.
+
+    A scene whose cameras have neither lens nor shutter is returned as it is.
+    """
+    has_lenses = any(
+        not (camera.is_pinhole or camera.is_orthographic)
+        for frame in scene.frames
+        for camera in frame.cameras.values()
+    )
+    if not has_lenses or not scene.seen_frames:
+        return scene
+    return dataclasses.replace(scene, frames=scene.seen_frames, seen_frames=None)
+
+
+def with_lenses_of(scene: Scene, recorded_frames: Sequence[Frame]) -> Scene:
+    """Return a scene of pinhole cameras with lenses and images as recorded, at its own poses.
+
+    Args:
+        scene: a scene of the same frames, whose poses may have been corrected.
+        recorded_frames: frames with the lenses.
+    """
+    recorded = {frame.index: frame for frame in recorded_frames}
+    frames = []
+    for frame in scene.frames:
+        cameras = {
+            name: dataclasses.replace(
+                recorded[frame.index].cameras[name],
+                camera_from_world=camera.camera_from_world,
+                timestamp_ns=camera.timestamp_ns,
+            )
+            for name, camera in frame.cameras.items()
+        }
+        image_paths = recorded[frame.index].image_paths
+        frames.append(dataclasses.replace(frame, cameras=cameras, image_paths=image_paths))
+    return with_recorded_frames(scene, tuple(frames))
+
+
 class LensFrames(NamedTuple):
     """Frames of a drive whose images were recorded through lenses.
 
@@ -187,7 +225,11 @@ def _write_folder(
     """Write the description of the copies, and return their folder."""
     from adapters.scene_cache import image_folder  # which imports the list of datasets
 
-    texts = sorted(f"{folder} {_optics_text(pair[0])}" for folder, pair in cameras.items())
+    # Copies of another size, as an earlier version may have left them, are not taken for these.
+    texts = sorted(
+        f"{folder} {_optics_text(camera)} {_optics_text(pinhole)}"
+        for folder, (camera, pinhole) in cameras.items()
+    )
     digest = hashlib.sha256(json.dumps(texts).encode()).hexdigest()[:8]
     paths = [Path(source) for source in sources.values()]
     folder = image_folder(f"{folder_name(name)}-{digest}", paths)

@@ -314,8 +314,8 @@ def _digest_with_tracks(uri: str, path: str, tracks: Path) -> str | None:
         path: the path in it.
         tracks: the file.
     """
-    others = other_scenes(tracks, path)
-    digests = [scene_digest(uri), *(scene_digest(other) for other in others)]
+    other_uris = other_scenes(tracks, path)
+    digests = [scene_digest(uri), *(scene_digest(other) for other in other_uris)]
     if None in digests:
         return None
     content = _content_digest(tracks, True, tracks.stat().st_size)

@@ -71,10 +71,15 @@ def open_scene_folder(path: str, query: dict[str, str]) -> Scene:
     if _DATA_KEY in query:
         new_recording = _recording_of_query(query[_DATA_KEY])
         if recorded is not None:
-            moved = (
-                with_images_in(new_recording.path, frame, recorded.path) for frame in scene.frames
+            frames, seen_frames = (
+                None
+                if of_scene is None
+                else tuple(
+                    with_images_in(new_recording.path, frame, recorded.path) for frame in of_scene
+                )
+                for of_scene in (scene.frames, scene.seen_frames)
             )
-            scene = dataclasses.replace(scene, frames=tuple(moved))
+            scene = dataclasses.replace(scene, frames=frames or (), seen_frames=seen_frames)
         recorded = new_recording
     try:
         if recorded is None or not recorded.is_there:

@@ -230,14 +230,14 @@ def _apply(
     """Return the scene with a file's changes."""
     check_track_ids(scene, [entry.track_id for entry in (*file.move, *file.remove)])
     recorded = {actor.track_id: actor for actor in scene.actors}
-    others = {
+    other_scenes_by_name = {
         name: open_other(_other_uri(name, path, scene_path))
         for name in dict.fromkeys(entry.scene for entry in file.add)
         if name is not None
     }
     added = []
     for entry in file.add:
-        other = scene if entry.scene is None else others[entry.scene]
+        other = scene if entry.scene is None else other_scenes_by_name[entry.scene]
         _check_same_unit(scene, other)
         check_track_ids(other, [entry.copy_of])
         source = next(actor for actor in other.actors if actor.track_id == entry.copy_of)

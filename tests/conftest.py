@@ -25,6 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 KERNELS = re.compile(
     r"^(import numba|from numba|from augment\.render\.cpu\.jit|import triton)", re.MULTILINE
 )
+SHAPES = re.compile(r"^\s*from jaxtyping import", re.MULTILINE)
 
 # Triton reads this where a kernel is defined: without a GPU its kernels run in Python.
 if not torch.cuda.is_available():
@@ -32,20 +33,24 @@ if not torch.cuda.is_available():
 
 
 def _checked_modules() -> list[str]:
-    """Modules of the library, without those that hold numba or Triton kernels.
+    """Modules of the library whose annotations state shapes, without those that hold numba or
+    Triton kernels.
 
-    The hook wraps every function it sees, and a wrapped kernel can be neither compiled nor cached.
+    The hook wraps every function of a module, and a wrapped kernel can be neither compiled nor
+    cached. Each call of a wrapped function costs tens of microseconds, and its import a compiled
+    wrapper: where no shape is stated, the type checker has the same annotations without running.
     """
-    paths = sorted((ROOT / "augment").rglob("*.py"))
+    texts = {path: path.read_text() for path in sorted((ROOT / "augment").rglob("*.py"))}
     names = [
         ".".join(path.relative_to(ROOT).with_suffix("").parts)
-        for path in paths
-        if path.name != "__init__.py" and not KERNELS.search(path.read_text())
+        for path, text in texts.items()
+        if path.name != "__init__.py" and SHAPES.search(text) and not KERNELS.search(text)
     ]
     assert "augment.scene.scene" in names and "augment.render.composite_kernels" not in names
     return names
 
 
+gc.disable()  # until all tests are imported: imports make millions of objects and hardly garbage
 install_import_hook(_checked_modules(), "beartype.beartype")
 
 
@@ -53,6 +58,7 @@ def pytest_collection_finish() -> None:
     """Spare the garbage collector what imports have made: jobs collect after every scene."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 # Files of a few long tests. At the end one of them would keep a single core busy.
@@ -60,7 +66,8 @@ LONG = {
     f"test_{name}.py"
     for name in (
         "bench", "cli", "fit", "fit_report", "flood_view", "generate", "generate_ray",
-        "job_workers", "packages", "procedural", "render_backward", "snow_view", "store", "style",
+        "job_workers", "packages", "procedural", "prune", "reconstruct_updates", "render_backward",
+        "rendered_suite", "score_suite", "snow_view", "store", "style", "weather_over_time",
     )
 }  # fmt: skip
 

@@ -6,6 +6,9 @@ import dataclasses
 import functools
 
 from adapters import base
+from augment.effects.wet.ground_map import EXPOSURE_SETTINGS
+from augment.exposure.exposed_surface import ExposedSurface, exposed_surface_of
+from augment.memo import memo_of
 from augment.scene.scene import Actor, Scene
 
 # The cheapest street there is: as few Gaussians as it can have, and few things in it.
@@ -17,20 +20,38 @@ LABELLED_STREET = (
     "&parked=1&moving=1&pedestrians=1"
 )
 
-_built = functools.lru_cache(maxsize=4)(base.open_scene)
+_built = functools.lru_cache(maxsize=6)(base.open_scene)
 
 
-def open_street(uri: str = SMALL_STREET) -> Scene:
+def open_street(uri: str = SMALL_STREET, *, has_wet_ground: bool = False) -> Scene:
     """The street of a URI as `open_scene` gives it: a new scene, of which nothing is remembered yet
     (beds of snow, covers, light), with the arrays of the earlier ones. They must not be changed.
+
+    has_wet_ground: if True, the scene remembers the exposed surface that rain wets, which takes
+    seconds to find and is found once a process: for tests of what is done with it.
     """
-    return dataclasses.replace(_built(uri))
+    street = dataclasses.replace(_built(uri))
+    return _with_wet_ground(street, uri, False) if has_wet_ground else street
 
 
-def open_fast_street(uri: str = LABELLED_STREET) -> Scene:
-    """A street on which everybody drives three times as fast as its track says."""
+def open_fast_street(uri: str = LABELLED_STREET, *, has_wet_ground: bool = False) -> Scene:
+    """A street on which everybody drives three times as fast as its track says. has_wet_ground: as
+    for `open_street`.
+    """
     street = open_street(uri)
-    return dataclasses.replace(street, actors=tuple(map(_hurried, street.actors)))
+    fast = dataclasses.replace(street, actors=tuple(map(_hurried, street.actors)))
+    return _with_wet_ground(fast, uri, True) if has_wet_ground else fast
+
+
+def _with_wet_ground(street: Scene, uri: str, is_fast: bool) -> Scene:
+    memo_of(street).put(("exposed surface", EXPOSURE_SETTINGS), _wet_ground(uri, is_fast))
+    return street
+
+
+@functools.lru_cache(maxsize=6)
+def _wet_ground(uri: str, is_fast: bool) -> ExposedSurface:
+    street = open_fast_street(uri) if is_fast else open_street(uri)
+    return exposed_surface_of(street, EXPOSURE_SETTINGS)
 
 
 def _hurried(actor: Actor) -> Actor:

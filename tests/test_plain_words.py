@@ -42,7 +42,7 @@ STUMBLES: dict[str, dict[str, int]] = {
     "adapters/camera_files": {"packed": 1},
     "adapters/drivestudio": {"packed": 1},
     "augment/dataset": {"vague": 2},
-    "augment/effects": {"packed": 10},
+    "augment/effects": {"packed": 9},
     "augment/files": {"packed": 2},
     "augment/render": {"packed": 2},
 }

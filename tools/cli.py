@@ -402,6 +402,8 @@ class RecordOptions(Command):
             recording has no metres.
         positions: A CSV table with the columns image, lat, lon, or image, x, y in metres: where
             images were taken. It also turns the recording's x to the east.
+        lens: recorded keeps the images as they are, and their lens in calibration.json; undistorted
+            takes the distortion out of them.
     """
 
     model: Positional[Path]
@@ -410,6 +412,7 @@ class RecordOptions(Command):
     fps: Annotated[float, Field(gt=0, le=1000)]
     camera_height: Annotated[float, Field(gt=0.05, le=20)] | None = None
     positions: Path | None = None
+    lens: Literal["undistorted", "recorded"] = "undistorted"
 
     def run(self) -> int:
         from tools.record import record_drive
@@ -773,6 +776,8 @@ class ScoreCommand(Command):
         nuscenes: The folder of nuScenes, for NDS by nuscenes-devkit.
         nuscenes_version: The version of its tables.
         nuscenes_split: The split whose samples the predictions have.
+        nuscenes_python: The Python that has nuscenes-devkit, if it is not this one: the devkit
+            needs an older NumPy.
         truth: Write the truth of each variant as a COCO file into this folder, with the numbers of
             images and categories, and score nothing.
         html: The page to write. By default PREDICTIONS/score.html.
@@ -789,6 +794,7 @@ class ScoreCommand(Command):
     nuscenes: Path | None = None
     nuscenes_version: str = "v1.0-trainval"
     nuscenes_split: str = "val"
+    nuscenes_python: Path | None = None
     truth: Path | None = None
     html: Path | None = None
     json_file: JsonFile = None

@@ -257,6 +257,12 @@ class Views:
         """Return the row's camera in the dataset's world, the world of the boxes."""
         manifest_row = self.rows.row(row)
         record, _ = self._reader.camera(manifest_row)
+        if record.lens is not None or record.shutter is not None:
+            raise OutputError(
+                f"{self._store.uri}: camera {record.name!r} has a lens or a rolling shutter, and "
+                f"views are compared as pinholes show them; render without lens=recorded in the "
+                f"scene's URI to measure how they agree"
+            )
         try:
             return Camera(
                 record.name,

@@ -18,6 +18,7 @@ from typing import Any
 
 from adapters.base import open_scene
 from adapters.datasets import DATASETS
+from adapters.recorded_lenses import undistorted_scene, with_lenses_of
 from adapters.training_views.checks import check_views, with_camera_times
 from adapters.training_views.starting_scene import complete_starting_scene
 from adapters.training_views.views import RecordedViews, holdout_step
@@ -27,6 +28,7 @@ from augment.files.scene_file import is_scene_folder, save_scene
 from augment.photo.trust import judge_scene
 from augment.reconstruct.trainer import StepRecord, Trainer
 from augment.reconstruct.view import ViewKey, ViewSource
+from augment.scene.cameras import Frame
 from augment.scene.scene import Scene
 from tools.fit_report import evaluate_views, mean_scores, truth_facts, truth_line, write_report
 from tools.options import FitOptions, parse_depth, resolved_uri
@@ -106,6 +108,8 @@ class _Run:
     source: RecordedViews
     notes: tuple[str, ...]
     checks: dict[str, Any]
+    recorded_frames: tuple[Frame, ...] | None
+    """Frames with the lenses that the fitted scene gets; None for a scene of pinholes."""
 
     def problems(self) -> list[str]:
         """Every sentence once; loading views may have added some since they were opened."""
@@ -113,7 +117,9 @@ class _Run:
 
 
 def _prepare(options: FitOptions, folder: Path, before: Checkpoint | None) -> _Run:
-    scene, notes = open_to_fit(options)
+    opened_scene, notes = open_to_fit(options)
+    scene = undistorted_scene(opened_scene)
+    recorded_frames = None if scene is opened_scene else opened_scene.frames
     source = _recorded_views(scene, options)
     checks = check_views(scene, source)
     notes = (*notes, *checks.problems)
@@ -154,7 +160,8 @@ def _prepare(options: FitOptions, folder: Path, before: Checkpoint | None) -> _R
         result="scene",
         changed=f"{options.scene} is not what {options.out} was fitted to so far",
     )
-    return _Run(options, training, scene, source, notes, dict(checks.report_facts))
+    facts_of_checks = dict(checks.report_facts)
+    return _Run(options, training, scene, source, notes, facts_of_checks, recorded_frames)
 
 
 def _recorded_views(scene: Scene, options: FitOptions) -> RecordedViews:
@@ -283,7 +290,9 @@ def _write(run: _Run, complete: bool) -> dict[str, Any]:
     made_by = {"command": "fit", "step": step, "steps": plan.steps}
     made_by |= {"settings": plan.settings, "data": plan.data, "fitted": _fitted(run)}
     scene = dataclasses.replace(training.trainer.scene(), made_by=made_by)
-    save_scene(scene, options.out.absolute())
+    recorded_frames = run.recorded_frames
+    stored_scene = scene if recorded_frames is None else with_lenses_of(scene, recorded_frames)
+    save_scene(stored_scene, options.out.absolute())
     trust = judge_scene(scene, scale=options.scale)
     for problem in trust.problems:
         print_note(f"not fit for weather: {problem}")

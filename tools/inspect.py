@@ -15,9 +15,10 @@ from adapters.base import open_scene
 from adapters.camera_files.paths import with_camera_path
 from adapters.raw_drive import IncompleteDrive
 from augment.errors import SceneError
+from augment.files.lens_records import lens_words
 from augment.light.scene_light import find_scene_light
 from augment.photo.trust import judge_scene
-from augment.scene.cameras import Frame
+from augment.scene.cameras import Camera, Frame
 from augment.scene.ground import describe_ground, ground_of
 from augment.scene.scene import Gaussians, Scene
 from augment.scene.semantics import SemanticClass
@@ -176,11 +177,23 @@ def _describe_cameras(frames: Sequence[Frame]) -> list[dict[str, Any]]:
                 "name": name,
                 "width": first.width,
                 "height": first.height,
-                "horizontal_fov_deg": float(np.degrees(2 * np.arctan(first.width / 2 / first.fx))),
+                "horizontal_fov_deg": _horizontal_view_deg(first),
                 "images": len(views),
+                **({} if first.lens is None else {"lens": lens_words(first.lens)}),
+                **({} if first.shutter is None else {"shutter": first.shutter.read_out}),
             }
         )
     return cameras
+
+
+def _horizontal_view_deg(camera: Camera) -> float:
+    """Return the angle between the rays of the left and the right border, at the middle row."""
+    if camera.lens is None:
+        return float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx)))
+    borders = np.array([[0.0, camera.height / 2], [camera.width, camera.height / 2]])
+    rays, is_inside = camera.lens.rays(borders, camera.intrinsics)
+    angles = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+    return float(np.degrees(np.where(is_inside, angles, camera.lens.max_angle_rad).sum()))
 
 
 def _describe_frames(frames: Sequence[Frame]) -> dict[str, Any]:

@@ -19,6 +19,7 @@ def record_drive(options: RecordOptions) -> int:
         fps=options.fps,
         camera_height_m=options.camera_height,
         positions=options.positions,
+        keeps_lens=options.lens == "recorded",
     )
     road = recording.road
     print(

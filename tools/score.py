@@ -11,9 +11,10 @@ from pydantic import ValidationError
 from augment.errors import ScoreError
 from augment.output.atomic import write_atomic
 from augment.output.store import open_store
+from augment.scores.nuscenes_metric import NuScenesSplit
 from augment.scores.score_suite import ScoreOptions, score_suite
 from augment.scores.suite_facts import read_suite
-from augment.scores.suite_scores import SuiteScores
+from augment.scores.suite_scores import Interval, SuiteScores
 from augment.scores.truth import coco_truth, read_truth
 from recipes.schema import Category
 from tools.output import print_note, write_json
@@ -38,9 +39,14 @@ def score_predictions(options: ScoreCommand) -> int:
             categories=parse_categories(options.categories),
             kitti_view=options.kitti_view,
             kitti_difficulty=options.kitti_difficulty,
-            nuscenes_root=options.nuscenes,
-            nuscenes_version=options.nuscenes_version,
-            nuscenes_split=options.nuscenes_split,
+            nuscenes=None
+            if options.nuscenes is None
+            else NuScenesSplit(
+                options.nuscenes,
+                options.nuscenes_version,
+                options.nuscenes_split,
+                options.nuscenes_python,
+            ),
         ),
     )
     print("\n".join(score_lines(scores)))
@@ -94,7 +100,7 @@ def score_lines(scores: SuiteScores) -> list[str]:
     """Return the scores as lines of text."""
     lines = [
         f"{scores.suite}: {scores.metric}; {scores.images} images of {scores.scenes} scenes each",
-        f"  clean {scores.clean:.4f}"
+        f"  clean {scores.clean:.4f}{_range_text(scores.clean_interval)}"
         + ("" if scores.recorded is None else f" (recorded images {scores.recorded:.4f})"),
     ]
     width = max(len(name) for name in scores.effects)
@@ -110,4 +116,22 @@ def score_lines(scores: SuiteScores) -> list[str]:
         f"  mPC {means.mpc:.4f}  rPC {means.rpc:.3f}  mRR {means.mrr:.3f}  mRA {means.mra:.3f}"
         + ("" if means.mce is None else f"  mCE {means.mce:.3f}  mRRA {means.mrra:+.3f}")
     )
+    if means.mpc_interval is not None:
+        intervals = {
+            "mPC": means.mpc_interval,
+            "mRR": means.mrr_interval,
+            "mCE": means.mce_interval,
+            "mRRA": means.mrra_interval,
+        }
+        texts = [
+            f"{name}{_range_text(interval)}"
+            for name, interval in intervals.items()
+            if interval is not None
+        ]
+        lines.append(f"  95 %, by scene: {', '.join(texts)}")
     return lines
+
+
+def _range_text(interval: Interval | None) -> str:
+    """Return an interval as a text after its value; empty for none."""
+    return "" if interval is None else f" ({interval[0]:.3f} to {interval[1]:.3f})"

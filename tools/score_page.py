@@ -10,7 +10,13 @@ import numpy as np
 
 from augment.output.codecs import decode_image
 from augment.output.store import Store
-from augment.scores.suite_scores import EffectScores, RecallBinScore, SuiteScores, WorstImage
+from augment.scores.suite_scores import (
+    EffectScores,
+    Interval,
+    RecallBinScore,
+    SuiteScores,
+    WorstImage,
+)
 from tools.report import make_environment, page_asset
 from tools.report_pictures import Picture, embed
 
@@ -99,17 +105,24 @@ def make_chart(name: str, effect: EffectScores) -> Chart:
         ]
         return Curve(title, css, points, [])
 
-    curves = [line("metric", "var(--accent)", [effect.clean, *(v.metric for v in effect.levels)])]
+    def whiskers_of(intervals: Sequence[Interval | None]) -> list[tuple[float, float, float]]:
+        pairs = zip(places_x[1:], intervals, strict=True)
+        return [
+            (x, height_of(interval[1]), height_of(interval[0]))
+            for x, interval in pairs
+            if interval is not None
+        ]
+
+    metric_line = line(
+        "metric", "var(--accent)", [effect.clean, *(v.metric for v in effect.levels)]
+    )
+    metric_whiskers = whiskers_of([level.metric_interval for level in effect.levels])
+    curves = [metric_line._replace(whiskers=metric_whiskers)]
     recalls = [effect.clean_recall, *(level.recall for level in effect.levels)]
     if None not in recalls:
         recall_line = line("recall", "var(--s2)", [value or 0.0 for value in recalls])
-        intervals = [level.recall_interval for level in effect.levels]
-        whiskers = [
-            (x, height_of(interval[1]), height_of(interval[0]))
-            for x, interval in zip(places_x[1:], intervals, strict=True)
-            if interval is not None
-        ]
-        curves.append(recall_line._replace(whiskers=whiskers))
+        recall_whiskers = whiskers_of([level.recall_interval for level in effect.levels])
+        curves.append(recall_line._replace(whiskers=recall_whiskers))
     numbers = ["clean"] + [
         str(level.level) if level.value is None else f"{level.value:g}" for level in effect.levels
     ]

@@ -19,10 +19,14 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from adapters.camera_files.colmap_tables import check_colmap_tables
+from adapters.camera_files.lenses import colmap_lens, nerfstudio_lens
 from adapters.plain_files import LARGEST, Number, read_json
 from adapters.world import invert_pose
 from augment.errors import AdapterError
+from augment.files.lens_records import LensRecord, ShutterRecord
 from augment.output.manifest import MAX_SIDE_PX
+from augment.scene.lenses import Lens as OpticalLens
+from augment.scene.shutter import RollingShutter
 
 # Largest error of a rotation, as in Camera. Poses written with four decimals or fewer fail.
 _ORTHONORMAL_TOLERANCE = 1e-4
@@ -40,6 +44,8 @@ class PosedView:
         image_path: the image's file. None if it does not exist.
         camera, frame: name and number. Both are None if the file does not say them.
         timestamp_ns: since the scene's first frame. None if the file has no times.
+        lens: lens of the camera. None for a pinhole.
+        shutter: rolling shutter of the camera. None if all pixels are exposed at once.
     """
 
     name: str
@@ -54,6 +60,8 @@ class PosedView:
     camera: str | None = None
     frame: int | None = None
     timestamp_ns: int | None = None
+    lens: OpticalLens | None = None
+    shutter: RollingShutter | None = None
 
 
 # Width, height, fx, fy, cx, cy of a pinhole camera in pixels.
@@ -236,8 +244,14 @@ def inria_views(content: list[object], path: Path) -> ViewSet:
     return ViewSet(tuple(views))
 
 
-def nerfstudio_views(content: object, path: Path) -> ViewSet:
-    """Return the views of nerfstudio's frames, in OpenCV's axes. Lens distortion is left out."""
+def nerfstudio_views(content: object, path: Path, *, has_lenses: bool = False) -> ViewSet:
+    """Return the views of nerfstudio's frames, in OpenCV's axes.
+
+    Args:
+        content: JSON.
+        path: its file.
+        has_lenses: if True, views have their lenses; if False, lens distortion is left out.
+    """
     file = validate(_NerfstudioFile, content, path, "nerfstudio transforms.json")
     views = []
     num_distorted: Counter[str] = Counter()
@@ -251,16 +265,24 @@ def nerfstudio_views(content: object, path: Path) -> ViewSet:
         model = (lens.camera_model or "OPENCV").upper()
         if model.startswith(("EQUIRECT", "ORTHO")):
             raise AdapterError(f"{where}: camera_model {model} has no pinhole camera near it")
-        if "FISHEYE" in model or any(getattr(lens, name) for name in _DISTORTION):
+        optical_lens = nerfstudio_lens(model, _distortion_of(lens)) if has_lenses else None
+        is_distorted = "FISHEYE" in model or any(_distortion_of(lens).values())
+        if is_distorted and optical_lens is None:
             num_distorted[model] += 1
         opencv_from_opengl = np.diag([1.0, -1.0, -1.0, 1.0])
         pose = np.asarray(frame.transform_matrix, dtype=np.float64)
         pose = check_pose(np.vstack([pose[:3], [0, 0, 0, 1]]) @ opencv_from_opengl, where=where)
         image = path.parent / frame.file_path
         image_path = str(image) if image.is_file() else None
-        views.append(PosedView(frame.file_path, *_pinhole(lens, where), pose, image_path))
+        pinhole = _pinhole(lens, where)
+        views.append(PosedView(frame.file_path, *pinhole, pose, image_path, lens=optical_lens))
     problems = [distortion_problem(str(path), n, m) for m, n in num_distorted.items()]
     return ViewSet(tuple(views), tuple(problems))
+
+
+def _distortion_of(lens: _Intrinsics) -> dict[str, float]:
+    """Return the coefficients of nerfstudio's intrinsics by name."""
+    return {name: getattr(lens, name) or 0.0 for name in _DISTORTION}
 
 
 def distortion_problem(where: str, count: int, model: str) -> str:
@@ -341,8 +363,14 @@ def _check_colmap_camera(camera: Any, where: str) -> None:
         )
 
 
-def read_colmap_views(model: Path) -> ViewSet:
-    """Read the views of the registered images. Lens distortion is left out and reported."""
+def read_colmap_views(model: Path, *, has_lenses: bool = False) -> ViewSet:
+    """Read the views of the registered images.
+
+    Args:
+        model: the folder of the model.
+        has_lenses: if True, views have their lenses; if False, lens distortion is left out and
+            reported.
+    """
     reconstruction = open_colmap_model(model)
     # Images of a model in project/sparse/0, project/sparse or project.
     folders = [parent / "images" for parent in (model, model.parent, model.parent.parent)]
@@ -353,7 +381,8 @@ def read_colmap_views(model: Path) -> ViewSet:
         if not image.has_pose:
             continue
         camera = reconstruction.cameras[image.camera_id]
-        if not camera.is_undistorted():
+        lens = colmap_lens(camera) if has_lenses else None
+        if lens is None and not camera.is_undistorted():
             num_distorted[camera.model_name] += 1
         where = f"{model}: image {image.name}"
         camera_from_world = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
@@ -363,7 +392,8 @@ def read_colmap_views(model: Path) -> ViewSet:
         principal_point = (camera.principal_point_x, camera.principal_point_y)
         pose = invert_pose(check_pose(camera_from_world, where=where))
         image_path = str(path) if path and path.is_file() else None
-        views.append(PosedView(image.name, *image_size, *focal, *principal_point, pose, image_path))
+        pinhole = (*image_size, *focal, *principal_point)
+        views.append(PosedView(image.name, *pinhole, pose, image_path, lens=lens))
     if not views:
         raise AdapterError(f"{model}: this COLMAP model holds no image with a pose")
     problems = [distortion_problem(str(model), n, m) for m, n in num_distorted.items()]
@@ -380,7 +410,8 @@ def read_colmap_views(model: Path) -> ViewSet:
 # Lengths and axes are those of the world the path is used in; cameras are OpenCV (x right, y down,
 # z forward). `fy` defaults to `fx`, `cx, cy` to the middle, `camera` to "camera". `timestamp_s`
 # counts from the scene's first frame, and entries of one time are one frame. Without times, the
-# n-th entry of every camera is frame n, 0.1 s apart.
+# n-th entry of every camera is frame n, 0.1 s apart. Beside `width` there may be a `lens`, and in a
+# frame a `shutter`, in the form of augment.files.lens_records.
 
 # int64 nanoseconds reach 9.2e9 s.
 Seconds = Annotated[float, Field(strict=True, ge=-9e9, le=9e9, allow_inf_nan=False)]
@@ -393,6 +424,7 @@ class _PathFrame(BaseModel):
     position: Vector | None = None
     look_at: Vector | None = None
     world_from_camera: Pose | None = None
+    shutter: ShutterRecord | None = None
 
     @model_validator(mode="after")
     def _check_pose_fields(self) -> _PathFrame:
@@ -410,6 +442,7 @@ class _PathFile(BaseModel):
     fy: Focal | None = None
     cx: Number | None = None
     cy: Number | None = None
+    lens: LensRecord | None = None
     frames: Annotated[list[_PathFrame], Field(min_length=1)]
 
     @model_validator(mode="after")
@@ -430,12 +463,24 @@ class _PathFile(BaseModel):
         return self
 
 
+def _shutter_of(frame: _PathFrame, where: str) -> RollingShutter | None:
+    """Return the rolling shutter of an entry of a camera path."""
+    try:
+        return None if frame.shutter is None else frame.shutter.shutter()
+    except ValueError as error:
+        raise AdapterError(f"{where}: shutter: {error}") from None
+
+
 def path_views(content: object, path: Path) -> ViewSet:
     """Return the views of a camera path."""
     file = validate(_PathFile, content, path, "camera path")
     times = sorted({f.timestamp_s for f in file.frames if f.timestamp_s is not None})
     frame_of_time = {time: number for number, time in enumerate(times)}
     num_views_of_camera: Counter[str] = Counter()
+    try:
+        lens = None if file.lens is None else file.lens.lens()
+    except ValueError as error:
+        raise AdapterError(f"{path}: lens: {error}") from None
     views = []
     for number, frame in enumerate(file.frames):
         where = f"{path}: frames.{number}"
@@ -452,6 +497,8 @@ def path_views(content: object, path: Path) -> ViewSet:
                 camera=frame.camera,
                 frame=num_views_of_camera[frame.camera] if time is None else frame_of_time[time],
                 timestamp_ns=None if time is None else round(time * 1e9),
+                lens=lens,
+                shutter=_shutter_of(frame, where),
             )
         )
         num_views_of_camera[frame.camera] += 1
@@ -463,9 +510,14 @@ def path_views(content: object, path: Path) -> ViewSet:
 _JSON_NAMES = ("cameras.json", "transforms.json")
 
 
-def read_views(path: Path) -> ViewSet:
+def read_views(path: Path, *, has_lenses: bool = False) -> ViewSet:
     """Read the views of a camera file, or of a folder with a COLMAP model or a JSON of a known
     name.
+
+    Args:
+        path: the file or folder.
+        has_lenses: if True, views of COLMAP and nerfstudio have their lenses; if False, lens
+            distortion is left out and reported. A camera path always has the lens that it states.
     """
     if not path.exists():
         raise AdapterError(
@@ -478,7 +530,8 @@ def read_views(path: Path) -> ViewSet:
             f"{path}: no cameras in this folder; looked for {', '.join(_JSON_NAMES)} and a COLMAP "
             "sparse model (cameras and images, .bin or .txt) in it, sparse/0 and sparse"
         )
-    return read_colmap_views(camera_file) if camera_file.is_dir() else read_camera_json(camera_file)
+    read_file = read_colmap_views if camera_file.is_dir() else read_camera_json
+    return read_file(camera_file, has_lenses=has_lenses)
 
 
 def find_camera_file(folder: Path) -> Path | None:
@@ -492,15 +545,20 @@ def find_camera_file(folder: Path) -> Path | None:
     return find_colmap_model(folder)
 
 
-def read_camera_json(path: Path) -> ViewSet:
-    """Read any of the three JSON formats, told apart by their keys."""
+def read_camera_json(path: Path, *, has_lenses: bool = False) -> ViewSet:
+    """Read any of the three JSON formats, told apart by their keys.
+
+    Args:
+        path: the file.
+        has_lenses: see `read_views`.
+    """
     content = read_json(path, object)
     if isinstance(content, list):
         return inria_views(content, path)
     frames = content.get("frames") if isinstance(content, dict) else None
     first_frame = frames[0] if isinstance(frames, list) and frames else None
     if isinstance(first_frame, dict) and "transform_matrix" in first_frame:
-        return nerfstudio_views(content, path)
+        return nerfstudio_views(content, path, has_lenses=has_lenses)
     if isinstance(content, dict) and "frames" in content:
         return path_views(content, path)
     description = f"a {type(content).__name__}"

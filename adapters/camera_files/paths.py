@@ -700,6 +700,8 @@ def _camera(name: str, view: PosedView, change: WorldChange, timestamp_ns: int) 
             *(view.width, view.height, view.fx, view.fy, view.cx, view.cy),
             camera_from_world=torch.from_numpy(camera_from_world),
             timestamp_ns=timestamp_ns,
+            lens=view.lens,
+            shutter=view.shutter,
         )
     except ValueError as error:
         raise AdapterError(f"image {view.name!r}: {error}") from error

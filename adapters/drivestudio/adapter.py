@@ -39,6 +39,7 @@ from adapters.drivestudio.drive import (
     read_instances,
     scene_from_model,
 )
+from adapters.recorded_lenses import split_lenses
 from adapters.uri import format_uri
 from adapters.world import WorldChange, with_class_of
 from augment.errors import AdapterError, SceneError
@@ -525,7 +526,13 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
         raise AdapterError(f"{where}: step must be a number of training steps; got {step!r}")
     models = dictionary_in(content, "models", where)
     corrections = read_corrections(models, run, where)
-    frames, frame_problems = read_drive(run, numbers, corrections)
+    frames, frame_problems = read_drive(run, numbers, corrections, options.lens)
+    lens_frames = split_lenses(
+        run.folder.absolute().name,
+        frames,
+        options.lens,
+        published=f"the images that {run.folder} was trained on",
+    )
     color_maps, image_color_maps = corrections.maps_of(run, frames)
     sky, sky_problems = read_sky(models, scene_from_model(run), where)
     background, background_problems = read_gaussians(
@@ -551,6 +558,7 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
         actors=tuple(actors),
         sky=sky,
         frames=frames,
+        seen_frames=lens_frames.frames if lens_frames.recorded_frames is not None else None,
         labels=DriveStudioLabels(run),
         color_maps=color_maps,
         image_color_maps=image_color_maps,
@@ -562,6 +570,7 @@ def open_drivestudio(path: str, query: dict[str, str]) -> Scene:
             *sky_problems,
             *corrections.problems,
             *frame_problems,
+            *lens_frames.notes,
             *renderer_problems,
         ),
         made_by={

@@ -46,6 +46,7 @@ from adapters.plain_files import (
     resolve_inside,
 )
 from adapters.raw_drive import DriveOptions, stored_records
+from adapters.recorded_lenses import LENS_MEANING, RECORDED_LENS, UNDISTORTED_LENS, LensChoice
 from adapters.uri import UriOptions
 from adapters.world import rotation_to_z_up
 from augment.errors import AdapterError
@@ -54,6 +55,7 @@ from augment.files.image_size import read_image_header
 from augment.scene.cameras import Camera, Frame
 from augment.scene.geometry import invert_rigid, quat_from_rotmat
 from augment.scene.labels import Boxes, LidarSweep
+from augment.scene.lenses import OpenCVLens
 
 # ---- A run's config.yaml, read by dotted keys such as `data.scene_idx` ---------------------------
 
@@ -146,6 +148,7 @@ class RunOptions(UriOptions):
         DriveOptions(),
         description="first:stop, numbers of the data's frames, either of them left out at will",
     )
+    lens: LensChoice = Field(UNDISTORTED_LENS, description=LENS_MEANING)
 
 
 # ---- What the processed data of each dataset means: cameras, axes, worlds, LiDAR columns ---------
@@ -555,11 +558,21 @@ def scene_from_dataset(run: Run) -> np.ndarray:
 
 
 def read_drive(
-    run: Run, numbers: tuple[int, ...], corrections: ImageCorrections
+    run: Run,
+    numbers: tuple[int, ...],
+    corrections: ImageCorrections,
+    lens: LensChoice = UNDISTORTED_LENS,
 ) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
     """Read frames, with the cameras as the model corrects them.
 
     A sentence is returned for each kind of thing that is missing.
+
+    Args:
+        run: the run.
+        numbers: the frames.
+        corrections: the model's changes of poses and colours.
+        lens: recorded for cameras with the lenses of the data, where the model was trained on
+            images without their distortion.
     """
     scene_from_dataset_matrix = scene_from_dataset(run)
     problems: list[str] = []
@@ -568,7 +581,7 @@ def read_drive(
             f"{run.data}: z of its world is not what is up for the first frame's car, which is "
             f"therefore taken to stand level"
         )
-    cameras = [_read_camera(run, position, problems) for position in range(len(run.cameras))]
+    cameras = [_read_camera(run, position, problems, lens) for position in range(len(run.cameras))]
     frames = []
     missing_images = []
     for number in numbers:
@@ -631,7 +644,7 @@ def _dataset_from_camera(run: Run, number: int, position: int) -> np.ndarray:
     return _world_pose(run, number) @ read_pose(folder / f"{camera}.txt") @ axes
 
 
-def _read_camera(run: Run, position: int, problems: list[str]) -> Camera:
+def _read_camera(run: Run, position: int, problems: list[str], lens: LensChoice) -> Camera:
     """Read a camera's intrinsics. Its pose is the identity."""
     number = run.cameras[position]
     downscale = run.settings.downscale[position]
@@ -642,9 +655,11 @@ def _read_camera(run: Run, position: int, problems: list[str]) -> Camera:
         raise AdapterError(
             f"{file} must hold fx fy cx cy k1 k2 p1 p2 k3 with fx, fy > 0; got {values.tolist()}"
         )
-    if values[4:].any():
+    is_undistorted = run.is_set("data.pixel_source.undistort")
+    has_lens = lens == RECORDED_LENS and bool(values[4:].any()) and is_undistorted
+    if values[4:].any() and not has_lens:
         training_kind = "as if it had none (undistort is off)"
-        if run.is_set("data.pixel_source.undistort"):
+        if is_undistorted:
             training_kind = "on images without it; the recorded images still have it"
         problems.append(
             f"camera {camera_kind.name}: its lens distortion is left out, as the model was trained "
@@ -675,7 +690,12 @@ def _read_camera(run: Run, position: int, problems: list[str]) -> Camera:
         )
     identity = torch.eye(4, dtype=torch.float64)
     camera = Camera(
-        camera_kind.name, camera_kind.width, camera_kind.height, *values[:4].tolist(), identity
+        camera_kind.name,
+        camera_kind.width,
+        camera_kind.height,
+        *values[:4].tolist(),
+        identity,
+        lens=OpenCVLens.from_coefficients(values[4:9].tolist()) if has_lens else None,
     )
     return camera.resized(width, height)
 

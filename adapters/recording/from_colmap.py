@@ -1,7 +1,7 @@
 """A recording from a COLMAP reconstruction of a video.
 
-`record_colmap` writes undistorted images, poses in metres with z up, and depth between the
-reconstructed points. COLMAP knows neither metres nor up. Both come from the road: the plane under
+`record_colmap` writes images, undistorted or with their lens, poses in metres with z up, and depth
+between the reconstructed points. COLMAP knows neither metres nor up. Both come from the road: the plane under
 the cameras on which most of the low points lie is taken as level; a camera's height above it, or
 GPS, gives the length of a unit. Without moving boxes everything that moves by itself is part of the
 street.
@@ -21,16 +21,20 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import torch
 from scipy.interpolate import LinearNDInterpolator
 from tqdm import tqdm
 
 from adapters.camera_files.camera_files import find_colmap_model, open_colmap_model
+from adapters.camera_files.lenses import colmap_lens
 from adapters.plain_files import LARGEST, decode_image, read_text, resolve_inside
 from adapters.recording.files import CALIBRATION, IMAGE_SUFFIXES
 from adapters.world import invert_pose
 from augment.errors import AdapterError
+from augment.files.lens_records import optics_record
 from augment.files.recorded_images import twelve_bits_fault
 from augment.output.codecs import encode_depth
+from augment.scene.cameras import Camera
 
 CAMERA = "camera"  # of images that lie in no folder of their own
 _JPEG_QUALITY = 97
@@ -119,6 +123,7 @@ def record_colmap(
     fps: float,
     camera_height_m: float | None = None,
     positions: Path | None = None,
+    keeps_lens: bool = False,
 ) -> RecordingSummary:
     """Write the recording of a COLMAP model to the folder `out`.
 
@@ -131,6 +136,8 @@ def record_colmap(
         camera_height_m: height of the cameras' middle above the road.
         positions: table of the places where images were taken, see `read_positions`. It also gives
             the north.
+        keeps_lens: if True, images keep their distortion and the calibration has the lens; if
+            False, images are undistorted.
 
     Raises:
         AdapterError: there is no model, image or road under the cameras, or the positions tell
@@ -157,9 +164,9 @@ def record_colmap(
     lane = _lane(list(egos.values()))
     frames: dict[int, dict[str, Any]] = {}
     for shot in tqdm(shots, desc="images", unit="image", disable=None):
-        lens = _write_image(shot, images, out)
+        camera = _write_image(shot, images, out, keeps_lens=keeps_lens)
         world = shot.points @ world_from_model[:3, :3].T + world_from_model[:3, 3]
-        _write_depth(out, shot, lens, poses[shot.name], scale * world, lane)
+        _write_depth(out, shot, camera, poses[shot.name], scale * world, lane)
         frame = frames.setdefault(
             shot.frame,
             {
@@ -169,7 +176,11 @@ def record_colmap(
                 "cameras": {},
             },
         )
-        frame["cameras"][shot.camera] = lens | {"world_from_camera": poses[shot.name].tolist()}
+        frame["cameras"][shot.camera] = {
+            **{"width": camera.width, "height": camera.height, **camera.intrinsics._asdict()},
+            "world_from_camera": poses[shot.name].tolist(),
+            **optics_record(camera),
+        }
     content = {
         "scene": out.absolute().name,
         "has_metric_scale": metres is not None,
@@ -433,16 +444,33 @@ def _fit_positions(
 # ---- Files ---------------------------------------------------------------------------------------
 
 
-def _write_image(shot: Shot, images: Path, out: Path) -> dict[str, Any]:
-    """Write the image without its lens's distortion, and return width, height, fx, fy, cx, cy."""
+def _write_image(shot: Shot, images: Path, out: Path, *, keeps_lens: bool) -> Camera:
+    """Write the image, and return its camera at the identity pose.
+
+    Args:
+        shot: the image.
+        images: the folder of the model's images.
+        out: the folder of the recording.
+        keeps_lens: if True, the image keeps its distortion, and its camera has the lens.
+
+    Raises:
+        AdapterError: the image cannot be used, or its lens cannot be kept.
+    """
     import pycolmap
 
     source = resolve_inside(images, shot.name, "the model")
     target = out / "images" / shot.camera / f"{shot.frame:06d}.jpg"
     target.parent.mkdir(parents=True, exist_ok=True)
     lens = shot.lens
+    optical_lens = colmap_lens(lens) if keeps_lens else None
+    if keeps_lens and optical_lens is None and not lens.is_undistorted():
+        raise AdapterError(
+            f"image {shot.name}: a lens of COLMAP's model {lens.model_name} cannot be kept; run "
+            f"COLMAP with OPENCV or OPENCV_FISHEYE, or record without --lens recorded"
+        )
+    is_kept = lens.is_undistorted() or optical_lens is not None
     pinhole = shot.lens
-    if not lens.is_undistorted():
+    if not is_kept:
         pinhole = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
     fx = pinhole.focal_length_x
     fy = pinhole.focal_length_y
@@ -457,8 +485,11 @@ def _write_image(shot: Shot, images: Path, out: Path) -> dict[str, Any]:
         )
     if fault := twelve_bits_fault(source):
         raise AdapterError(f"{source} {fault}")
-    if lens.is_undistorted() and source.suffix.lower() in (".jpg", ".jpeg"):
+    if is_kept and source.suffix.lower() in (".jpg", ".jpeg"):
         shutil.copyfile(source, target)
+    elif optical_lens is not None:
+        target = target.with_suffix(".png")
+        target.write_bytes(cv2.imencode(".png", image)[1].tobytes())
     else:
         u, v = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
         rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], axis=-1)
@@ -469,8 +500,13 @@ def _write_image(shot: Shot, images: Path, out: Path) -> dict[str, Any]:
         image = cv2.remap(image, lens_px[..., 0], lens_px[..., 1], cv2.INTER_LINEAR)
         flags = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
         target.write_bytes(cv2.imencode(".jpg", image, flags)[1].tobytes())
-    size = {"width": int(pinhole.width), "height": int(pinhole.height)}
-    return size | {"fx": float(fx), "fy": float(fy), "cx": float(cx), "cy": float(cy)}
+    return Camera(
+        shot.camera,
+        *(int(pinhole.width), int(pinhole.height)),
+        *(float(fx), float(fy), float(cx), float(cy)),
+        camera_from_world=torch.eye(4, dtype=torch.float64),
+        lens=optical_lens,
+    )
 
 
 def _lane(egos: Sequence[np.ndarray]) -> np.ndarray:
@@ -488,7 +524,7 @@ def _lane(egos: Sequence[np.ndarray]) -> np.ndarray:
 def _write_depth(
     out: Path,
     shot: Shot,
-    lens: Mapping[str, Any],
+    camera: Camera,
     world_from_camera: np.ndarray,
     points: np.ndarray,
     lane: np.ndarray,
@@ -501,11 +537,17 @@ def _write_depth(
     near = lane[np.linalg.norm(lane - centre, axis=1) < _LANE_REACH_M]
     local = (np.concatenate([points, near]) - centre) @ turn
     local = local[local[:, 2] > 0.1]
-    uv = local[:, :2] / local[:, 2:] * [lens["fx"], lens["fy"]] + [lens["cx"], lens["cy"]]
-    size = np.array([lens["width"], lens["height"]])
-    is_in_image = ((uv > 0) & (uv < size)).all(axis=1)
+    size = np.array([camera.width, camera.height])
+    if camera.lens is None:
+        uv = local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    else:
+        uv, _ = camera.lens.project(local, camera.intrinsics)
+    with np.errstate(invalid="ignore"):
+        is_in_image = ((uv > 0) & (uv < size)).all(axis=1)
     uv = uv[is_in_image]
-    inverse = 1 / local[is_in_image, 2]
+    is_along_ray = camera.lens is not None and camera.lens.is_depth_along_ray
+    distance = np.linalg.norm(local, axis=1) if is_along_ray else local[:, 2]
+    inverse = 1 / distance[is_in_image]
     if len(np.unique(uv.round(), axis=0)) < 4:
         return
     interpolator = LinearNDInterpolator(uv, inverse, fill_value=0.0)

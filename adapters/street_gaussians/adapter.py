@@ -45,6 +45,7 @@ from adapters.raw_drive import (
     objects_that_travel,
     scene_of_drive,
 )
+from adapters.recorded_lenses import RECORDED_LENS, LensFrames, split_lenses
 from adapters.safe_pickle import check_holds_object, stream_arrays
 from adapters.street_gaussians.data import (
     CAMERA_NAMES,
@@ -59,6 +60,7 @@ from adapters.street_gaussians.data import (
     read_times,
     read_track_table,
     track_files,
+    with_lenses,
 )
 from adapters.street_gaussians.model import (
     SCHEME,
@@ -123,7 +125,13 @@ def open_street_gaussians(path: str, query: dict[str, str]) -> Scene:
         frames=frames,
         labels=labels_of(files.data),
         world_origin_m=data.world_origin_m,
-        problems=(*data.problems, *selection.problems, *model.problems, *problems),
+        problems=(
+            *data.problems,
+            *selection.problems,
+            *model.problems,
+            *problems,
+            *([_TRAINED_AS_PINHOLES] if options.lens == RECORDED_LENS else []),
+        ),
         color_maps=by_camera,
         image_color_maps={k: v for k, v in by_image.items() if k in image_times},
         recorded_source=format_uri(SCHEME, files.data, {}),
@@ -803,6 +811,12 @@ _LIDAR_TOP_DEG = 2.4
 # Least and greatest corner of the recording car in its own frame, whose origin is on the ground
 # below its rear axle.
 _EGO_BOX_M = np.array([[-1.4, -1.15, 0.1], [4.2, 1.15, 2.4]])
+# Note on a trained model of which recorded lenses are asked for.
+_TRAINED_AS_PINHOLES = (
+    "the model was trained on the recorded images as if they were those of pinholes, so it has "
+    "their lens distortion in its Gaussians: lens=recorded changes nothing; of the "
+    "dataset's folder alone it keeps the lenses"
+)
 # Classes that never move.
 _STATIC_CLASSES = ("sign",)
 
@@ -826,6 +840,15 @@ def open_raw(root: Path, query: dict[str, str]) -> Scene:
     frames = frames_of(data)
     selection = options.select([f.index for f in frames], where=f"{SCHEME}:{root}")
     frames = tuple(frame for frame in frames if frame.index in set(selection.numbers))
+    lens_frames = LensFrames(frames, None, ())
+    if options.has_recorded_lens:
+        lens_frames = split_lenses(
+            root.absolute().name,
+            with_lenses(root, frames),
+            options.lens,
+            published=f"images of {root}, whose intrinsics/ have no distortion,",
+        )
+        frames = lens_frames.frames
     sweeps, sweep_problems = _read_sweeps(
         root, [f for f in frames if f.index not in selection.held_out]
     )
@@ -840,7 +863,8 @@ def open_raw(root: Path, query: dict[str, str]) -> Scene:
         labels=StreetGaussiansLabels(root),
         world_origin_m=data.world_origin_m,
         lidar_top_deg=_LIDAR_TOP_DEG,
-        problems=(*data.problems, *selection.problems, *sweep_problems),
+        problems=(*data.problems, *selection.problems, *sweep_problems, *lens_frames.notes),
+        recorded_frames=lens_frames.recorded_frames,
     )
     scene = scene_of_drive(drive, options)
     missing_problems = without_points(join_tracks(drive.boxes), scene)

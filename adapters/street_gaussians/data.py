@@ -13,6 +13,7 @@ dataset has them. The callers are `adapters.street_gaussians.adapter` and `.mode
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import re
 from collections import Counter
@@ -43,6 +44,7 @@ from augment.files.image_size import ImageHeader, read_image_header
 from augment.files.recorded_images import exif_hint
 from augment.scene.cameras import Camera, Frame
 from augment.scene.geometry import quat_from_rotmat, rotmat_from_quat, slerp
+from augment.scene.lenses import OpenCVLens
 
 CAMERA_NAMES = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")
 Number = Annotated[int, Field(ge=0, lt=10**9)]  # of a frame or object
@@ -708,6 +710,26 @@ def read_data(root: Path, config: ModelConfig) -> StreetData:
         objects=tracked_objects(table, visible_rows, tracklets.ids, frames, times, visible_span_s),
         tracklets=tracklets,
         problems=(*path.problems, *problems, *image_problems, *table.problems),
+    )
+
+
+def with_lenses(root: Path, frames: Sequence[Frame]) -> tuple[Frame, ...]:
+    """Return frames whose cameras have the lenses of intrinsics/: k1 k2 p1 p2 k3 of Waymo."""
+    lens_of_camera: dict[str, OpenCVLens] = {}
+    for cam in calibrated_cameras(root):
+        coefficients = read_numbers(root / "intrinsics" / f"{cam}.txt")[4:9]
+        if coefficients.any():
+            lens = OpenCVLens.from_coefficients(coefficients.tolist())
+            lens_of_camera[CAMERA_NAMES[cam]] = lens
+    return tuple(
+        dataclasses.replace(
+            frame,
+            cameras={
+                name: dataclasses.replace(camera, lens=lens_of_camera.get(name))
+                for name, camera in frame.cameras.items()
+            },
+        )
+        for frame in frames
     )
 
 

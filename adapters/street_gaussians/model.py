@@ -20,6 +20,7 @@ from torch import Tensor
 from adapters.camera_files.camera_files import validate
 from adapters.plain_files import read_yaml
 from adapters.raw_drive import DriveOptions
+from adapters.recorded_lenses import LENS_MEANING, UNDISTORTED_LENS, LensChoice
 from adapters.street_gaussians.data import ModelConfig, Number
 from adapters.street_gaussians.dataset import DATA_FOLDERS
 from adapters.uri import UriOptions
@@ -74,6 +75,7 @@ class ModelOptions(UriOptions):
         DriveOptions(),
         description="first:stop, frame numbers with stop excluded, either side may be empty",
     )
+    lens: LensChoice = Field(UNDISTORTED_LENS, description=LENS_MEANING)
     rotation_bug: Literal["0", "1"] = Field(
         "0", description="0 or 1; actors turned as an older release of the project turned them"
     )

@@ -49,6 +49,7 @@ def boxes_2d(sample: Mapping[str, Any]) -> Boxes2d:
             f"scene {sample['scene']!r}, frame {sample['frame']}: the sample has no boxes; open "
             f"the dataset with 'boxes' in load, of a variant whose recipe writes labels"
         )
+    _check_pinhole(camera)
     centers_m, quats = boxes_in_camera(boxes, camera)
     rotations = rotmat_from_quat(torch.from_numpy(quats)).numpy()  # NaN of quaternions of zeros
     size = (camera["width"], camera["height"])
@@ -58,6 +59,20 @@ def boxes_2d(sample: Mapping[str, Any]) -> Boxes2d:
     return Boxes2d(
         torch.from_numpy(outlines.xyxy.astype(np.float32)), torch.from_numpy(outlines.in_view)
     )
+
+
+def _check_pinhole(camera: Mapping[str, Any]) -> None:
+    """Raise ValueError for a camera with a lens or a shutter, through which nothing is projected.
+
+    Args:
+        camera: `camera` of a sample.
+    """
+    if camera["lens"] is not None or camera["shutter"] is not None:
+        raise ValueError(
+            f"camera {camera['name']!r} has a lens or a rolling shutter, and boxes are projected "
+            f"here as a pinhole shows them; take the sample's own modal_xyxy and the box tables, "
+            f"which are measured in the image itself, or open the scene without lens=recorded"
+        )
 
 
 def boxes_in_camera(
@@ -191,6 +206,7 @@ def box_masks(sample: Mapping[str, Any]) -> torch.Tensor:
             f"masks need boxes and depth; the sample of scene {sample['scene']!r}, frame "
             f"{sample['frame']} lacks {'boxes' if boxes is None else 'depth'}"
         )
+    _check_pinhole(camera)
     K = camera["K"].numpy()
     view = Camera(
         camera["name"],

@@ -496,6 +496,11 @@ def kitti_calibration(camera: CameraRecord, world_from_ego: torch.Tensor) -> str
     """Return the text of a file of calib. P0 to P3 are this camera's projection, and its frame is
     the rectified one. The ego frame (x forward, y left, z up) stands for the LiDAR's and the IMU's.
     """
+    if camera.lens is not None or camera.shutter is not None:
+        raise OutputError(
+            f"camera {camera.name!r} has a lens or a rolling shutter, which KITTI's calib cannot "
+            f"hold; write coco or yolo, or render without lens=recorded in the scene's URI"
+        )
     projection = np.concatenate([camera.K.numpy(), np.zeros((3, 1))], axis=1)
     camera_from_ego = (invert_rigid(camera.world_from_camera) @ world_from_ego).numpy()[:3]
     matrices = {

@@ -3,7 +3,8 @@
 A sample is a dictionary:
 
     image             float32 [3, H, W] in [0, 1], or uint8 if asked for; RGB, display-encoded
-    depth             float32 [H, W], metres along the optical axis, 0 = none; or None
+    depth             float32 [H, W], metres along the optical axis (along the ray of a pixel for a
+                      fisheye or an f-theta lens), 0 = none; or None
     semantic          uint8 [H, W], augment.scene.semantics.SemanticClass; or None
     instance          int32 [H, W], 0 = none, else the object's number: `boxes` has them; or None
     water             bool [H, W], where a ray meets water first; None where there is no flood
@@ -14,7 +15,8 @@ A sample is a dictionary:
     boxes             all boxes of the frame, see `box_tensors`; None where there are none
     lidar             the frame's sweep, see `lidar_tensors`; None where there is none
     camera            name, width, height, timestamp_ns, K float64 [3, 3] in pixels of the image,
-                      world_from_camera, world_from_ego float64 [4, 4] in the dataset's world
+                      world_from_camera, world_from_ego float64 [4, 4] in the dataset's world;
+                      lens and shutter as calibration.json has them, None for a pinhole
     weather           the recipe's numbers by name, floats; NaN where absent
     paths             the files by kind (image, depth, ...), None where there is none
     scene, variant    names;  frame: the dataset's number;  recipe_hash: 16 hexadecimal digits
@@ -39,6 +41,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.utils.data import get_worker_info
 
+from augment.files.lens_records import lens_record, shutter_record
 from augment.output.box_tables import BoxWeather
 from augment.output.box_weather import box_tables, combine_visibility
 from augment.output.calibration import CameraRecord
@@ -186,7 +189,17 @@ def make_sample(
         sample["boxes"] = box_tensors(labels.boxes, weather, *axes, instances=labels.instances)
     if labels.lidar is not None:
         sample["lidar"] = lidar_tensors(labels.lidar, *axes)
-    return {**sample, "camera": {**vars(camera), "world_from_ego": world_from_ego}, **metadata}
+    return {**sample, "camera": _camera_entry(camera, world_from_ego), **metadata}
+
+
+def _camera_entry(camera: CameraRecord, world_from_ego: torch.Tensor) -> dict[str, Any]:
+    """Return the camera of a sample, with lens and shutter in the form of calibration.json."""
+    return {
+        **vars(camera),
+        "lens": None if camera.lens is None else lens_record(camera.lens),
+        "shutter": None if camera.shutter is None else shutter_record(camera.shutter),
+        "world_from_ego": world_from_ego,
+    }
 
 
 def image_tensor(rgb: np.ndarray, image_type: ImageType) -> torch.Tensor:
@@ -318,10 +331,10 @@ def collate_frames(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     Images and buffers of one size are stacked to [N, ...]. Of unlike sizes they stay a list, as do
     masks of water and snow where a sample has none. Cameras have K [N, 3, 3], world_from_camera and
-    world_from_ego [N, 4, 4], int64 [N] tensors, and a list of names. Weather is float64 [N] per
-    number, NaN where a sample lacks it. Everything else, boxes above all, is a list with one entry
-    a sample. Clips gain the same dimension in front: image [N, T, C, 3, H, W], K [N, T, C, 3, 3],
-    frame [N, T]. Pairs become a dictionary of two batches.
+    world_from_ego [N, 4, 4], int64 [N] tensors, and lists of names, lenses and shutters. Weather is
+    float64 [N] per number, NaN where a sample lacks it. Everything else, boxes above all, is a list
+    with one entry a sample. Clips gain the same dimension in front: image [N, T, C, 3, H, W],
+    K [N, T, C, 3, 3], frame [N, T]. Pairs become a dictionary of two batches.
 
     Raises:
         ValueError: some samples have an image or buffer that others lack, masks excepted: datasets
@@ -357,6 +370,8 @@ def _check_in_all(key: str, samples: Sequence[Mapping[str, Any]]) -> None:
         )
 
 
+# Entries of a camera that are no numbers.
+_CAMERA_LISTS = ("name", "lens", "shutter")
 Stack = Callable[[list[torch.Tensor]], torch.Tensor]
 
 
@@ -391,10 +406,11 @@ def _stack_shared(tensors: list[torch.Tensor]) -> torch.Tensor:
 def stack_cameras(cameras: Sequence[Mapping[str, Any]], stack: Stack) -> dict[str, Any]:
     """Stack the matrices and numbers of cameras.
 
-    Names become a list; so do matrices and numbers of clips that differ in shape.
+    Names, lenses and shutters become a list; so do matrices and numbers of clips that differ in
+    shape.
     """
     values = {key: [camera[key] for camera in cameras] for key in cameras[0]}
-    return {k: v if k == "name" else _stack_numbers(v, stack) for k, v in values.items()}
+    return {k: v if k in _CAMERA_LISTS else _stack_numbers(v, stack) for k, v in values.items()}
 
 
 def _stack_numbers(values: list[Any], stack: Stack) -> Any:

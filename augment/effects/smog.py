@@ -44,6 +44,7 @@ from augment.render.linear_airlight import mix_linear_light
 from augment.render.scatter import scatter_forward, scattered_share
 from augment.scene.boxes import NOT_COUNTED, WorldBoxes, pixels_of_boxes
 from augment.scene.cameras import Camera
+from augment.scene.pixel_rays import pixel_rays_of
 from augment.scene.scene import Scene
 from augment.timing import timed
 from augment.view.layers import LayerRenderer
@@ -417,7 +418,13 @@ def mean_transmittance(
     transmittance = transmittance_to(points).mean(axis=1)
     if surface_depth_m is not None:
         pixels[:] = 0
+        rays = None if camera.is_pinhole else pixel_rays_of(camera)
         for number, rows, columns in pixels_of_boxes(boxes, camera, surface_depth_m):
+            if rays is not None:
+                points_m = rays.points_at(rows, columns, surface_depth_m[rows, columns])
+                pixels[number] = len(rows)
+                transmittance[number] = float(transmittance_to(points_m).mean())
+                continue
             z = surface_depth_m[rows, columns].astype(np.float64)
             across = (columns + 0.5 - camera.cx) / camera.fx
             down = (rows + 0.5 - camera.cy) / camera.fy

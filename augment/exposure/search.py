@@ -432,10 +432,7 @@ def _parked_actors(scene: Scene) -> list[PosedGaussians]:
             number,
         )
         for number, actor in enumerate(scene.actors, start=1)
-        if actor.label != EGO_VEHICLE
-        and not actor.track.is_absent
-        and not is_moving(actor)
-        and len(actor.gaussians)
+        if actor.label != EGO_VEHICLE and not is_moving(actor) and len(actor.gaussians)
     ]
 
 

@@ -144,6 +144,11 @@ def _fact_losses(scene: Scene, writer: SplatWriter) -> Iterator[str]:
                 f"viewers take the principal points of cameras.json to be in the middle of the "
                 f"image; they lie up to {offset_px:.1f} px off"
             )
+    if cameras and writer.has_camera_file and any(c.lens or c.shutter for c in cameras):
+        yield (
+            "lenses and rolling shutters are left out of cameras.json, which has pinholes: there "
+            "the cameras look the same way with the same focal length"
+        )
     if any(camera.is_orthographic for camera in cameras):
         yield "orthographic cameras are left out"
     if scene.made_by:

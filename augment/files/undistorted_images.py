@@ -35,11 +35,12 @@ _MAX_BYTES = 1 << 26
 _MAX_IMAGE_BYTES = 1 << 30
 # JPEG quality of the copies, as of other undistorted images.
 _JPEG_QUALITY = 95
-# Limits of the copy's focal length, parts of the lens's at its axis.
-_MIN_ZOOM = 0.4
-_MAX_ZOOM = 4.0
-# Precision of the focal length, part of the lens's.
-_ZOOM_STEP = 1e-6
+# Part of the reach in the middle of the sides that a copy must have, at least.
+_MIN_REACH = 0.2
+# Side of a copy from which on it is a multiple of 8, pixels.
+_MIN_EVEN_PX = 256
+# Precision of that part.
+_REACH_STEP = 1e-4
 # Field of view of a copy over the longer side, at most: beyond it, corners become coarse.
 _MAX_VIEW_DEG = 110.0
 
@@ -47,8 +48,8 @@ _MAX_VIEW_DEG = 110.0
 def inner_pinhole(camera: Camera) -> Camera:
     """Return the pinhole camera of a lens camera's undistorted image.
 
-    Size, principal point and pose are the camera's. The focal length is the shortest whose image
-    shows recorded pixels only.
+    Pose and focal lengths are the camera's. The image reaches as far as the recorded one does in
+    the middle of its sides, less what is needed so that its border shows recorded pixels only.
 
     Args:
         camera: a camera with a lens.
@@ -56,30 +57,70 @@ def inner_pinhole(camera: Camera) -> Camera:
     Raises:
         ValueError: the distortion leaves no such image.
     """
-    half_side_px = max(camera.width, camera.height) / 2
-    view_zoom = half_side_px / np.tan(np.radians(_MAX_VIEW_DEG / 2)) / max(camera.fx, camera.fy)
-    low = max(_MIN_ZOOM, float(view_zoom))
-    high = max(_MAX_ZOOM, low)
-    if _is_recorded(camera, low):
-        high = low
-    elif not _is_recorded(camera, high):
+    low, high = _reach(camera)
+    smallest = _MIN_REACH
+    largest = 1.0
+    if _is_recorded(camera, low, high):
+        smallest = largest
+    elif not _is_recorded(camera, smallest * low, smallest * high):
         raise ValueError("the distortion leaves no undistorted picture")
-    while high - low > _ZOOM_STEP:
-        middle = (low + high) / 2
-        if _is_recorded(camera, middle):
-            high = middle
+    while largest - smallest > _REACH_STEP:
+        middle = (smallest + largest) / 2
+        if _is_recorded(camera, middle * low, middle * high):
+            smallest = middle
         else:
-            low = middle
-    return replace(camera, fx=high * camera.fx, fy=high * camera.fy, lens=None, shutter=None)
+            largest = middle
+    return _pinhole_of(camera, smallest * low, smallest * high)
 
 
-def _is_recorded(camera: Camera, zoom: float) -> bool:
+def _reach(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and the highest x / z and y / z, [2] each, on the lines through the
+    principal point, up to _MAX_VIEW_DEG.
+    """
+    assert camera.lens is not None
+    end = np.tan(np.radians(_MAX_VIEW_DEG / 2))
+    limits = np.array([[-end, -end], [end, end]])
+    for axis, (length, centre) in enumerate(
+        ((camera.width, camera.cx), (camera.height, camera.cy))
+    ):
+        for side, place in enumerate((0.5, length - 0.5)):
+            pixel = np.array([camera.cx, camera.cy])
+            pixel[axis] = place
+            ray, is_inside = camera.lens.rays(pixel, camera.intrinsics)
+            if is_inside and ray[2] > 0 and 0.5 < centre < length - 0.5:
+                slope = ray[axis] / ray[2]
+                limits[side, axis] = np.clip(slope, *limits[:, axis])
+    return limits[0], limits[1]
+
+
+def _pinhole_of(camera: Camera, low: np.ndarray, high: np.ndarray) -> Camera:
+    """Return the pinhole camera whose image reaches from `low` to `high`, [2], x / z and y / z."""
+    left, top = np.ceil(low * (camera.fx, camera.fy)).astype(int)
+    right, bottom = np.floor(high * (camera.fx, camera.fy)).astype(int)
+    return replace(
+        camera,
+        width=_even_side(int(right - left)),
+        height=_even_side(int(bottom - top)),
+        cx=float(-left),
+        cy=float(-top),
+        lens=None,
+        shutter=None,
+    )
+
+
+def _even_side(length_px: int) -> int:
+    """Return a side that decoders can halve three times, if it is long, no longer than given."""
+    is_long = length_px >= _MIN_EVEN_PX
+    return length_px - length_px % 8 if is_long else max(1, length_px)
+
+
+def _is_recorded(camera: Camera, low: np.ndarray, high: np.ndarray) -> bool:
     """Return True if the border of a pinhole image lies inside of the recorded one."""
-    columns = np.arange(camera.width) + 0.5
-    rows = np.arange(camera.height) + 0.5
-    u = np.concatenate([columns, columns, 0 * rows + 0.5, 0 * rows + camera.width - 0.5])
-    v = np.concatenate([0 * columns + 0.5, 0 * columns + camera.height - 0.5, rows, rows])
-    pinhole = replace(camera, fx=zoom * camera.fx, fy=zoom * camera.fy, lens=None, shutter=None)
+    pinhole = _pinhole_of(camera, low, high)
+    columns = np.arange(pinhole.width) + 0.5
+    rows = np.arange(pinhole.height) + 0.5
+    u = np.concatenate([columns, columns, 0 * rows + 0.5, 0 * rows + pinhole.width - 0.5])
+    v = np.concatenate([0 * columns + 0.5, 0 * columns + pinhole.height - 0.5, rows, rows])
     pixels, is_inside = _recorded_pixels(camera, pinhole, u, v)
     with np.errstate(invalid="ignore"):
         is_inside = is_inside & (pixels >= 0).all(-1)
@@ -93,35 +134,46 @@ def _recorded_pixels(
     assert camera.lens is not None
     x = (u - pinhole.cx) / pinhole.fx
     y = (v - pinhole.cy) / pinhole.fy
-    return camera.lens.project(np.stack([x, y, np.ones_like(x)], -1), camera.intrinsics)
+    rays = np.stack([x, y, np.ones_like(x)], -1).astype(np.float64)
+    return camera.lens.project(rays, camera.intrinsics)
 
 
 def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
-    """Return an image as a pinhole camera would show it.
+    """Return an image as a pinhole camera would show it. Beyond the image its border is repeated.
 
     Args:
         image: the recorded image, [H, W, 3] or [H, W].
-        camera: the camera that recorded it, with its lens.
-        pinhole: a pinhole camera of the same pose.
+        camera: the camera that recorded it, with its lens, at the image's size.
+        pinhole: a pinhole camera at the same place, which may be turned.
     """
     assert camera.lens is not None
+    turn = camera.camera_from_world[:3, :3] @ pinhole.camera_from_world[:3, :3].T
+    rows = tuple(turn.flatten().tolist())
+    if torch.equal(camera.camera_from_world, pinhole.camera_from_world):
+        rows = tuple(np.eye(3).ravel().tolist())
     size = pinhole.width, pinhole.height
-    u, v = _maps(camera.lens, camera.intrinsics, pinhole.intrinsics, *size)
+    u, v = _maps(camera.lens, camera.intrinsics, pinhole.intrinsics, *size, rows)
     return cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
 @lru_cache(maxsize=16)
 def _maps(
-    lens: Lens, intrinsics: Intrinsics, pinhole: Intrinsics, width: int, height: int
+    lens: Lens,
+    intrinsics: Intrinsics,
+    pinhole: Intrinsics,
+    width: int,
+    height: int,
+    camera_from_pinhole: tuple[float, ...],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the recorded position of each undistorted pixel, as maps for cv2.remap.
 
-    Its pixel centres are whole numbers.
+    Its pixel centres are whole numbers. camera_from_pinhole is a rotation, row by row.
     """
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     x = (u - pinhole.cx) / pinhole.fx
     y = (v - pinhole.cy) / pinhole.fy
-    pixels, _ = lens.project(np.stack([x, y, np.ones_like(x)], -1), intrinsics)
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.reshape(camera_from_pinhole, (3, 3)).T
+    pixels, _ = lens.project(rays.astype(np.float64), intrinsics)
     pixels = np.nan_to_num(pixels - 0.5, nan=-1e6)
     return cv2.convertMaps(
         pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32), cv2.CV_16SC2
@@ -132,7 +184,7 @@ def _maps(
 
 
 class _CameraRecord(BaseModel):
-    """A camera with its lens, and the focal lengths of its copies."""
+    """A camera with its lens, and the pinhole of its copies, which has its focal lengths."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     width: PositiveInt
@@ -142,15 +194,25 @@ class _CameraRecord(BaseModel):
     cx: float
     cy: float
     lens: LensRecord
-    pinhole_fx: float
-    pinhole_fy: float
+    pinhole_width: PositiveInt
+    pinhole_height: PositiveInt
+    pinhole_cx: float
+    pinhole_cy: float
 
     def cameras(self, name: str) -> tuple[Camera, Camera]:
         """Return the camera with its lens, and the pinhole of its copies."""
         pose = torch.eye(4, dtype=torch.float64)
         numbers = (self.width, self.height, self.fx, self.fy, self.cx, self.cy)
         camera = Camera(name, *numbers, camera_from_world=pose, lens=self.lens.lens())
-        return camera, replace(camera, fx=self.pinhole_fx, fy=self.pinhole_fy, lens=None)
+        pinhole = replace(
+            camera,
+            width=self.pinhole_width,
+            height=self.pinhole_height,
+            cx=self.pinhole_cx,
+            cy=self.pinhole_cy,
+            lens=None,
+        )
+        return camera, pinhole
 
 
 class UndistortedImages(BaseModel):
@@ -202,8 +264,9 @@ def write_undistorted(
         assert camera.lens is not None
         records[name] = {
             **{"width": camera.width, "height": camera.height, **camera.intrinsics._asdict()},
-            **{"lens": lens_record(camera.lens), "pinhole_fx": pinhole.fx},
-            "pinhole_fy": pinhole.fy,
+            "lens": lens_record(camera.lens),
+            **{"pinhole_width": pinhole.width, "pinhole_height": pinhole.height},
+            **{"pinhole_cx": pinhole.cx, "pinhole_cy": pinhole.cy},
         }
     content = UndistortedImages.model_validate({"cameras": records, "sources": dict(sources)})
     write_copy(folder / UNDISTORTED, content.model_dump_json().encode())

@@ -308,6 +308,8 @@ def _facts(path: str) -> os.stat_result | None:
 
 # Folder of the copies in the output folder.
 MIRROR_FOLDER = "source"
+# First letters of a record's name.
+RECORD_START = "climategs-mirror-"
 # Kind of the links to files that are not replaced.
 Links = Literal["hard", "copy"]
 
@@ -351,7 +353,7 @@ def mirror_folder(out_dir: Path, variant: str) -> Path:
 
 def record_names(tree: DatasetFolder, folder: Path) -> tuple[Path, Path]:
     """Return the paths of a complete copy's record, and of the record while the copy is changed."""
-    record = folder / f"climategs-mirror-{tree.root.name}.json"
+    record = folder / f"{RECORD_START}{tree.root.name}.json"
     return record, record.with_name(record.name + ".begun")
 
 

@@ -30,7 +30,7 @@ from torch import Tensor
 from augment.files.recorded_images import ImageFault, read_scaled
 from augment.memo import memo_of
 from augment.photo.own_car_outline import find_symmetric_outline, refine_outline
-from augment.scene.cameras import Camera
+from augment.scene.cameras import Camera, Frame
 from augment.scene.scene import Scene
 
 T = TypeVar("T")
@@ -422,15 +422,28 @@ def _shape_in(scene: Scene, name: str) -> _CarShape | None:
     if scene.ego_masks is None:
         return _find_own_car(scene, name)
     mask = scene.ego_masks.get(name)
-    camera = next((f.cameras[name] for f in scene.frames if name in f.cameras), None)
+    images = _image_frames(scene, name)
+    camera = next((f.cameras[name] for f in (*images, *scene.frames) if name in f.cameras), None)
     if mask is None or camera is None or not mask.any():
         return None
     return _CarShape(camera.resized(mask.shape[1], mask.shape[0]), mask=mask)
 
 
+def _image_frames(scene: Scene, name: str) -> list[Frame]:
+    """Return the frames in which the camera of this name has an image of a pinhole.
+
+    Where a scene shows images with their lenses, these are the frames with the undistorted copies.
+    """
+    frames, copies = (
+        [f for f in of_scene if name in f.image_paths and name in f.cameras]
+        for of_scene in (scene.frames, scene.seen_frames or ())
+    )
+    return [f for f in (copies if frames and copies else frames) if f.cameras[name].is_pinhole]
+
+
 def _find_own_car(scene: Scene, name: str) -> _CarShape | None:
     """Return the outline that a camera's images at _SCALE tell; None where they tell none."""
-    frames = [f for f in scene.frames if name in f.cameras and name in f.image_paths]
+    frames = _image_frames(scene, name)
     frames = [frames[i] for i in moving_frames([f.cameras[name] for f in frames])]
     cameras = []
     images = []

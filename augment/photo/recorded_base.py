@@ -31,7 +31,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -45,7 +45,7 @@ from augment.light.cast_shadows import FadedShadows
 from augment.memo import memo_of
 from augment.photo.photo_objects import copy_size
 from augment.photo.photo_surface import CLEAR_ALPHA, MIN_ROAD_FALL, OPAQUE_ALPHA, complete_surfaces
-from augment.photo.sky_matte import SkyMatte, sky_matte
+from augment.photo.sky_matte import SkyMatte, sky_matte, sky_matte_of_view
 from augment.render import photo_kernels as kernels
 from augment.render.buffers import (
     AUTO,
@@ -969,6 +969,30 @@ class Photo:
         return rows, torch.arange(left, left + camera.width, device=device)
 
 
+class PhotoView(NamedTuple):
+    """A view of an image that was recorded through a lens."""
+
+    pixels: UInt8[np.ndarray, "H W 3"]
+    """The image in the view."""
+    frame: Frame
+    """The frame of the image, with the lenses."""
+    lens_camera: Camera
+    """The camera with its lens and without its shutter, at the view's place."""
+
+
+def _read_photo(scene: Scene, camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
+    """Return the recorded image of a pinhole camera of the scene, at the camera's size.
+
+    Raises:
+        SceneError: there is no photo, or it cannot be read.
+    """
+    path, recorded_camera = find_recorded(scene, camera)
+    try:
+        return read_scaled(path, recorded_camera, camera)
+    except ImageFault as fault:
+        raise SceneError(f"camera {camera.name}: recorded image {path} {fault}") from None
+
+
 def open_photo(
     scene: Scene,
     camera: Camera,
@@ -976,6 +1000,7 @@ def open_photo(
     *,
     backend: str,
     finds_sky: bool = False,
+    view: PhotoView | None = None,
 ) -> Photo:
     """Return the photo of a camera of the scene, at the camera's size, before any style.
 
@@ -985,15 +1010,13 @@ def open_photo(
         color_map: colour map that the finished picture gets; None without one.
         backend: backend that draws.
         finds_sky: if True, the photo has its sky matte.
+        view: the photo in this view, of a camera with a lens or a shutter; None if the photo is
+            that of `camera`.
 
     Raises:
         SceneError: there is no photo, it cannot be read, or the colour map has no inverse.
     """
-    path, recorded_camera = find_recorded(scene, camera)
-    try:
-        pixels = read_scaled(path, recorded_camera, camera)
-    except ImageFault as fault:
-        raise SceneError(f"camera {camera.name}: recorded image {path} {fault}") from None
+    pixels = _read_photo(scene, camera) if view is None else view.pixels
     scene_from_recorded = None
     if color_map is not None:
         matrix = color_map[:, :3].double()
@@ -1010,7 +1033,11 @@ def open_photo(
     if scene.has_known_gravity and scene.ground_z_m is not None:
         camera_height_m = float(camera.centre[2]) - scene.ground_z_m
         height_m = min(camera_height_m, MAX_CAMERA_HEIGHT_M) if camera_height_m > 0 else None
-    matte = sky_matte(scene, camera, pixels) if finds_sky else None
+    matte = None
+    if finds_sky and view is None:
+        matte = sky_matte(scene, camera, pixels)
+    elif finds_sky and view is not None:
+        matte = sky_matte_of_view(scene, view.frame, view.lens_camera, camera, pixels)
     return Photo(camera, pixels, backend, scene_from_recorded, height_m, matte=matte)
 
 

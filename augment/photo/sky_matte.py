@@ -77,6 +77,10 @@ _THIN_LUMA_SHARE = 0.25
 # Radii of the windows over which the sky's colour is averaged, the narrowest that holds sky first,
 # pixels of half the working size.
 _SKY_WINDOWS_PX = (2, 8, 32)
+# Least share of a view that the undistorted copy of its image shows for the copy's sky to count.
+_MIN_COPY_SHARE = 0.7
+# Difference of a view from a recorded one that is rounding of its size, pixels.
+_MAX_VIEW_OFFSET_PX = 2.0
 # Weight of each window over the one before.
 _WINDOW_WEIGHT = 1e-3
 
@@ -112,6 +116,8 @@ def sky_matte(
     frame = recorded_frame(scene, camera)
     if frame is None:
         return None
+    if not is_same_view(frame.cameras[camera.name], camera):
+        return None
     regions = recorded_sky_regions(scene, frame, camera.name)
     if regions is None:
         return None
@@ -122,7 +128,14 @@ def sky_matte(
         except ImageFault:
             return None
     image = rgb
-    key = "sky matte", frame.index, camera.name, camera.width, camera.height, camera.cx, camera.cy
+    numbers = camera.width, camera.height, camera.cx, camera.cy, camera.fx, camera.fy
+    key = (
+        "sky matte",
+        frame.index,
+        camera.name,
+        *numbers,
+        camera.camera_from_world.numpy().tobytes(),
+    )
     packed = memo_of(scene.as_recorded).get(key, lambda: _refine(image, regions))
     return SkyMatte(*unpack_matte(packed, image))
 
@@ -175,14 +188,17 @@ def _resize_returns(has_return: np.ndarray, height: int, width: int) -> np.ndarr
 
 
 def recorded_frame(scene: Scene, camera: Camera) -> Frame | None:
-    """Return the frame in which a camera recorded an image at this time and pose; None without."""
+    """Return the frame in which a camera recorded an image at this time and place; None without.
+
+    Where a scene shows images with their lenses, it is the frame with the undistorted copies.
+    """
 
     def index() -> dict[tuple[str, int], Frame]:
         return {
             (name, frame.cameras[name].timestamp_ns): frame
-            for frame in (*(scene.seen_frames or ()), *scene.frames)
+            for frame in (*scene.frames, *(scene.seen_frames or ()))
             for name in frame.image_paths
-            if name in frame.cameras
+            if name in frame.cameras and frame.cameras[name].is_pinhole
         }
 
     scene = scene.as_recorded
@@ -190,9 +206,94 @@ def recorded_frame(scene: Scene, camera: Camera) -> Frame | None:
     frame = frames.get((camera.name, camera.timestamp_ns))
     if frame is None:
         return None
-    pose = frame.cameras[camera.name].camera_from_world
-    is_same = torch.allclose(pose, camera.camera_from_world, rtol=0, atol=1e-6)
+    centre = frame.cameras[camera.name].centre
+    is_same = torch.allclose(centre, camera.centre, rtol=0, atol=1e-6)
     return frame if is_same else None
+
+
+def is_same_view(recorded: Camera, camera: Camera) -> bool:
+    """Return True if a camera at any scale, or a window of it, looks as the recorded one."""
+    if not torch.allclose(recorded.camera_from_world, camera.camera_from_world, rtol=0, atol=1e-6):
+        return False
+    scales = camera.fx / recorded.fx, camera.fy / recorded.fy
+    middle = (abs(recorded.cx * scales[0] - camera.cx), abs(recorded.cy * scales[1] - camera.cy))
+    sizes = (
+        abs(recorded.width * scales[0] - camera.width),
+        abs(recorded.height * scales[1] - camera.height),
+    )
+    return max(*middle, *sizes) <= _MAX_VIEW_OFFSET_PX
+
+
+def sky_matte_of_view(
+    scene: Scene, frame: Frame, lens_camera: Camera, view: Camera, rgb: UInt8[np.ndarray, "H W 3"]
+) -> SkyMatte | None:
+    """Return the sky matte of an image that was recorded through a lens, in a pinhole view of it.
+
+    Args:
+        scene: the scene.
+        frame: the frame of the image.
+        lens_camera: the camera with its lens, at the view's place.
+        view: the view.
+        rgb: the image in the view.
+    """
+    numbers = view.width, view.height, *view.intrinsics
+    pose = view.camera_from_world.numpy().tobytes()
+    key = "sky matte of view", frame.index, view.name, *numbers, pose
+
+    def make() -> tuple[PackedMatte | None]:  # a value that is None would be made again
+        small = view.scaled(min(1.0, WORK_WIDTH / view.width))
+        kinds = _kinds_of_copy(scene, frame, lens_camera, small)
+        if kinds is None:
+            kinds = _kinds_in_view(scene, frame, small, rgb)
+        return (None if kinds is None else _refine(rgb, kinds),)
+
+    packed = memo_of(scene).get(key, make)[0]
+    return None if packed is None else SkyMatte(*unpack_matte(packed, rgb))
+
+
+def _kinds_of_copy(
+    scene: Scene, frame: Frame, lens_camera: Camera, view: Camera
+) -> UInt8[np.ndarray, "h w"] | None:
+    """Return the kinds of pixels that the undistorted copy of an image tells of a view.
+
+    Beyond the copy the nearest pixel counts. None where there is no copy, where it is too dark, or
+    where the view lies beside it.
+    """
+    of_frame = (f for f in scene.seen_frames or () if f.index == frame.index)
+    copy_frame = next(of_frame, None)
+    copy = None if copy_frame is None else copy_frame.cameras.get(view.name)
+    if copy_frame is None or copy is None or not copy.is_pinhole:
+        return None
+    kinds = recorded_sky_regions(scene, copy_frame, view.name)
+    if kinds is None:
+        return None
+    # The lens and its copy are of one camera, whatever the pose of a strip of the image.
+    turn = (lens_camera.camera_from_world[:3, :3] @ view.camera_from_world[:3, :3].T).numpy()
+    small = copy.resized(kinds.shape[1], kinds.shape[0])
+    columns, rows = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    x = (columns - view.cx) / view.fx
+    y = (rows - view.cy) / view.fy
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ turn.T
+    z = np.maximum(rays[..., 2], 1e-6)
+    u = np.floor(small.fx * rays[..., 0] / z + small.cx)
+    v = np.floor(small.fy * rays[..., 1] / z + small.cy)
+    is_inside = (rays[..., 2] > 0) & (u >= 0) & (u < small.width) & (v >= 0) & (v < small.height)
+    if is_inside.mean() < _MIN_COPY_SHARE:
+        return None
+    last_row = small.height - 1
+    last_column = small.width - 1
+    return kinds[v.clip(0, last_row).astype(int), u.clip(0, last_column).astype(int)]
+
+
+def _kinds_in_view(
+    scene: Scene, frame: Frame, view: Camera, rgb: UInt8[np.ndarray, "H W 3"]
+) -> UInt8[np.ndarray, "h w"] | None:
+    """Return the kinds of pixels that the image itself tells, as `find_sky_regions`."""
+    points = sweep_of(scene, frame.index)
+    if points is None:
+        return find_regions(rgb, view)
+    top_rad = highest_channel_rad(scene, points, view)
+    return find_regions(rgb, view, find_returns(points, view), top_rad)
 
 
 def recorded_sky_regions(scene: Scene, frame: Frame, name: str) -> UInt8[np.ndarray, "m n"] | None:

@@ -34,13 +34,19 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from augment.memo import memo_of
 from augment.photo.lidar_view import elevation_rad
-from augment.photo.sky_matte import read_small_image, recorded_frame, recorded_sky_regions
+from augment.photo.sky_matte import (
+    is_same_view,
+    read_small_image,
+    recorded_frame,
+    recorded_sky_regions,
+)
 from augment.photo.sky_regions import SOFT_EDGE, SURFACE, WORK_WIDTH
 from augment.render.buffers import ALPHA, AUTO, MEDIAN_DEPTH, RGB, SPLAT_IDS
 from augment.render.constants import SURFACE_ALPHA
 from augment.render.rasterize import rasterize
 from augment.scene.cameras import Camera, Frame
 from augment.scene.labels import EGO_VEHICLE
+from augment.scene.pinhole_scene import pinhole_scene
 from augment.scene.scene import Scene, Track
 
 # Distance from which a surface before the sky fades in any fog and casts no pane, metres.
@@ -409,9 +415,35 @@ def _find_recorded_sky(scene: Scene, camera: Camera) -> _RecordedSky | None:
     kinds = recorded_sky_regions(scene, frame, camera.name)
     if kinds is None:
         return None
+    recorded = frame.cameras[camera.name]
+    if not is_same_view(recorded, camera):
+        return _RecordedSky(
+            is_sky=_seen_in(kinds >= SOFT_EDGE, recorded, camera),
+            is_solid=_seen_in(kinds == SURFACE, recorded, camera),
+        )
     return _RecordedSky(
         is_sky=_enlarge(kinds >= SOFT_EDGE, camera), is_solid=_enlarge(kinds == SURFACE, camera)
     )
+
+
+def _seen_in(mask: np.ndarray, recorded: Camera, camera: Camera) -> np.ndarray:
+    """Return a mask of a recorded image as another camera at its place sees it.
+
+    Pixels beyond the recorded image are False.
+
+    Args:
+        mask: bool [h, w], of the image at any size.
+        recorded: the pinhole camera of the image.
+        camera: the other camera.
+    """
+    small = recorded.resized(mask.shape[1], mask.shape[0])
+    rays = camera.ray_directions().numpy() @ small.camera_from_world[:3, :3].numpy().T
+    z = np.maximum(rays[..., 2], 1e-6)
+    columns = np.where(rays[..., 2] > 0, small.fx * rays[..., 0] / z + small.cx - 0.5, -2.0)
+    rows = np.where(rays[..., 2] > 0, small.fy * rays[..., 1] / z + small.cy - 0.5, -2.0)
+    places = columns.astype(np.float32), rows.astype(np.float32)
+    border = cv2.BORDER_CONSTANT
+    return cv2.remap(mask.astype(np.uint8), *places, cv2.INTER_NEAREST, borderMode=border) > 0
 
 
 def _enlarge(mask: np.ndarray, camera: Camera) -> np.ndarray:
@@ -858,7 +890,11 @@ def judge_scene(
             are not drawn.
         backend: the rasteriser's backend.
     """
-    frames = scene.frames if frames is None else frames
+    pinholes = pinhole_scene(scene)
+    pinhole_frames = {frame.index: frame for frame in pinholes.frames}
+    judged_frames = scene.frames if frames is None else frames
+    frames = [pinhole_frames.get(frame.index, frame) for frame in judged_frames]
+    scene = pinholes
     names = dict.fromkeys(name for frame in frames for name in frame.cameras)
     chosen_names = [name for name in names if cameras is None or name in cameras]
     judged_cameras = tuple(

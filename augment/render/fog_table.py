@@ -286,8 +286,8 @@ def look_up(table: BankTable, offsets: Float[Tensor, "*B 3"]) -> Float[Tensor, "
 
     def node_value(start: Tensor) -> Tensor:
         """Return the value between two nodes of a heading."""
-        pair = (logs[number].to(offsets.dtype) for number in (start, start + 1))
-        return torch.lerp(*pair, along)
+        value = logs[start].to(offsets.dtype)
+        return torch.lerp(value, logs[start + 1].to(offsets.dtype), along)
 
     def layer_value(start: Tensor) -> Tensor:
         """Return the value between four neighbours at one climb."""

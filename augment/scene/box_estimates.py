@@ -31,6 +31,7 @@ from augment.errors import ClimateGSError
 from augment.memo import LatestValue, memo_of
 from augment.scene.boxes import MIN_DEPTH_M, Occlusion, Outlines, WorldBoxes
 from augment.scene.cameras import Camera
+from augment.scene.pixel_rays import depth_of, local_rays, project_points
 from augment.scene.scene import Scene
 
 _log = logging.getLogger(__name__)
@@ -256,6 +257,8 @@ class _BoxesInImage:
         camera = self.camera
         camera_from_world = self.camera.camera_from_world.numpy()
         local = points_m @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+        if not camera.is_pinhole:
+            return project_points(camera, points_m)[0], depth_of(camera, local)
         z = np.where(local[:, 2] > MIN_DEPTH_M, local[:, 2], np.nan)
         pixels = local[:, :2] / z[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         return pixels, local[:, 2]
@@ -386,9 +389,7 @@ class _BoxesInImage:
         camera = self.camera
         rotation = self.boxes.rotations[number]
         world_from_camera = camera.world_from_camera.numpy()
-        across = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-        rays = np.concatenate([across, np.ones((len(pixels), 1))], axis=1)
-        rays = rays @ world_from_camera[:3, :3].T @ rotation
+        rays = local_rays(camera, pixels) @ world_from_camera[:3, :3].T @ rotation
         rays = np.where(rays == 0, 1e-300, rays)
         eye = (world_from_camera[:3, 3] - self.boxes.centres_m[number]) @ rotation
         high = self.boxes.sizes_m[number] / 2

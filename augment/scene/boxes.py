@@ -25,6 +25,14 @@ from augment.scene.box_kernels import count_box_pixels
 from augment.scene.cameras import Camera
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.labels import Boxes, LabelSource
+from augment.scene.lens_boxes import (
+    BoxFrames,
+    count_pixels_through_lens,
+    crossings,
+    project_edges,
+    windows_of,
+)
+from augment.scene.pixel_rays import pixel_rays_of
 from augment.scene.scene import Scene
 from augment.scene.semantics import SemanticClass
 
@@ -105,6 +113,9 @@ def pixels_of_boxes(
         camera: the camera of the image.
         depth_m: z of the surface that decides whose pixel it is, metres; 0 = none.
     """
+    if not camera.is_pinhole:
+        yield from _pixels_through_lens(boxes, camera, depth_m)
+        return
     windows = pixel_windows(boxes, camera)
     world_from_camera = camera.world_from_camera.numpy()
     across = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx  # x / z of the pixels' rays
@@ -118,6 +129,36 @@ def pixels_of_boxes(
         if len(pixels_inside):
             rows, columns = np.divmod(pixels_inside, right - left)
             yield number, rows + top, columns + left
+
+
+def _pixels_through_lens(
+    boxes: WorldBoxes, camera: Camera, depth_m: Float32[np.ndarray, "H W"]
+) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Yield the pixels of `pixels_of_boxes` for a camera with a lens or a rolling shutter."""
+    rays = pixel_rays_of(camera)
+    frames = _frames_of(boxes)
+    for number, (left, top, right, bottom) in enumerate(pixel_windows(boxes, camera)):
+        if left >= right or top >= bottom:
+            continue
+        window = (slice(top, bottom), slice(left, right))
+        enter, leave = crossings(rays, window, frames, number, is_owned=True)
+        z = depth_m[window]
+        rows, columns = np.nonzero((z > 0) & (enter <= z) & (z <= leave))
+        if len(rows):
+            yield number, rows + top, columns + left
+
+
+def _frames_of(boxes: WorldBoxes) -> BoxFrames:
+    """Return the frames and sides of boxes, as rays are tested with."""
+    half = boxes.sizes_m / 2
+    low = boxes.low_m
+    high = boxes.high_m
+    return BoxFrames(
+        boxes.centres_m,
+        boxes.rotations,
+        np.stack([low, high], axis=1),
+        np.stack([np.maximum(low, -half), np.minimum(high, half)], axis=1),
+    )
 
 
 def are_usable(
@@ -207,6 +248,8 @@ def pixel_windows(boxes: WorldBoxes, camera: Camera) -> Int64[np.ndarray, "B 4"]
     middles = (boxes.low_m + boxes.high_m)[:, None, :] / 2
     extents = (boxes.high_m - boxes.low_m)[:, None, :]
     corners = _to_world(boxes.centres_m, boxes.rotations, middles + CORNERS * extents)
+    if not camera.is_pinhole:
+        return windows_of(project_edges(corners, EDGES, camera), boxes.is_usable, camera)
     camera_from_world = camera.camera_from_world.numpy()
     corners = corners @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
     a = corners[:, EDGES[:, 0]]  # [B, 12, 3]
@@ -310,12 +353,52 @@ class Occlusion:
 
 def outline_world_boxes(boxes: WorldBoxes, camera: Camera) -> Outlines:
     """Return the outlines of boxes in the scene's world."""
+    if not camera.is_pinhole:
+        return _outline_through_lens(boxes, camera)
     world_from_camera = camera.world_from_camera.numpy()
     rotation = world_from_camera[:3, :3]
     centers_m = (boxes.centres_m - world_from_camera[:3, 3]) @ rotation
     rotations = np.where(boxes.is_usable[:, None, None], rotation.T @ boxes.rotations, np.nan)
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     return outline_boxes(centers_m, boxes.sizes_m, rotations, K, (camera.width, camera.height))
+
+
+def _outline_through_lens(boxes: WorldBoxes, camera: Camera) -> Outlines:
+    """Return the outlines of boxes for a camera with a lens or a rolling shutter.
+
+    The image's corners count where their rays meet a box, whose edges then may all lie outside.
+    """
+    pieces = project_edges(boxes.corners_m, EDGES, camera)
+    size = np.array([camera.width, camera.height], np.float64)
+    ends, is_shown = _clip_edges(pieces.first, pieces.second, pieces.is_shown, size)
+    rows = np.array([0, 0, camera.height - 1, camera.height - 1])
+    columns = np.array([0, camera.width - 1, 0, camera.width - 1])
+    corner_points = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size
+    rays = pixel_rays_of(camera)
+    frames = _frames_of(boxes)
+    labelled = replace(frames, labelled_m=np.stack([-boxes.sizes_m, boxes.sizes_m], axis=1) / 2)
+    hits = np.zeros((len(boxes), 4), bool)
+    for number in range(len(boxes)):
+        for corner, (row, column) in enumerate(zip(rows, columns, strict=True)):
+            window = (slice(row, row + 1), slice(column, column + 1))
+            enter, leave = crossings(rays, window, labelled, number, is_owned=False)
+            hits[number, corner] = max(enter[0, 0], MIN_DEPTH_M) <= leave[0, 0]
+    points = np.concatenate([ends, np.broadcast_to(corner_points, (len(ends), 4, 2))], axis=1)
+    is_shown = np.concatenate([is_shown, hits], axis=1)
+    low = np.where(is_shown[..., None], points, np.inf).min(axis=1, initial=np.inf)
+    high = np.where(is_shown[..., None], points, -np.inf).max(axis=1, initial=-np.inf)
+    in_view = boxes.is_usable & (high > low).all(axis=1)
+    xyxy = np.where(in_view[:, None], np.concatenate([low, high], axis=1), 0.0)
+    truncated_fraction = np.where(boxes.is_usable, 1.0, np.nan)
+    for number in np.flatnonzero(in_view):
+        is_projected = pieces.is_shown[number]
+        whole = np.concatenate(
+            [pieces.first[number][is_projected], pieces.second[number][is_projected]]
+        )
+        area = _hull_area(whole) if len(whole) else 0.0
+        shown_area = _hull_area(points[number][is_shown[number]])
+        truncated_fraction[number] = min(max(1 - shown_area / area, 0.0), 1.0) if area > 0 else 0.0
+    return Outlines(xyxy, in_view, truncated_fraction)
 
 
 def outline_boxes(
@@ -392,6 +475,18 @@ def find_occlusion(
         instance = np.zeros((0, 0), np.uint16)
         numbers = np.zeros(num_boxes, np.int64)
     scenery = np.zeros((0, 0), bool) if classes is None else np.isin(classes, _NO_OBJECT)
+    if not camera.is_pinhole:
+        counts, owners = count_pixels_through_lens(
+            pixel_rays_of(camera),
+            _frames_of(boxes),
+            pixel_windows(boxes, camera),
+            depth_m,
+            instance,
+            scenery,
+            numbers,
+            MIN_DEPTH_M,
+        )
+        return _occlusion_of(counts, owners if with_owners else None)
     world_from_camera = camera.world_from_camera.numpy()
     box_from_world = boxes.rotations.transpose(0, 2, 1)
     axes = box_from_world @ world_from_camera[:3, :3]  # columns: the camera's axes in each box
@@ -417,10 +512,20 @@ def find_occlusion(
         counts,
         owners,
     )
+    return _occlusion_of(counts, owners if with_owners else None)
+
+
+def _occlusion_of(counts: np.ndarray, owners: np.ndarray | None) -> Occlusion:
+    """Return the record of counted pixels.
+
+    Args:
+        counts: rows of `count_box_pixels`, int64 [B, 6].
+        owners: the boxes that pixels show; None unless asked for.
+    """
     num_shown = counts[:, 0]
     bounds = counts[:, 2:].astype(np.float64)
     modal = np.where(num_shown[:, None] > 0, bounds, np.nan)
-    return Occlusion(num_shown, counts[:, 1], modal, owners if with_owners else None)
+    return Occlusion(num_shown, counts[:, 1], modal, owners)
 
 
 def _edges_in_image(
@@ -438,14 +543,30 @@ def _edges_in_image(
     """
     ends, is_shown = _project_edges(corners_m, K)
     a, b = np.split(ends, 2, axis=1)  # [B, 12, 2]
-    is_shown = is_shown[:, :12]
+    return _clip_edges(a, b, is_shown[:, :12], size)
+
+
+def _clip_edges(
+    a: np.ndarray, b: np.ndarray, is_shown: np.ndarray, size: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return both ends of those parts of straight edges that the image shows.
+
+    Args:
+        a: pixels at which the edges begin, [B, E, 2].
+        b: pixels at which they end, [B, E, 2].
+        is_shown: edges before the camera, [B, E].
+        size: width and height of the image.
+
+    Returns:
+        Pixels [B, 2 E, 2], and the mask of ends of edges that have such a part [B, 2 E].
+    """
     # Liang and Barsky 1984: the part t in [start, end] of a + t (b - a) between both borders.
     along = np.where(a == b, 1e-300, b - a)
     with np.errstate(over="ignore"):  # of an edge that is a point: outside or inside, both infinite
         crossings = np.sort(np.stack([-a / along, (size - a) / along]), axis=0)
     start = crossings[0].max(axis=-1, initial=0.0).clip(0.0, None)
     end = crossings[1].min(axis=-1, initial=1.0).clip(None, 1.0)
-    is_shown &= start <= end
+    is_shown = is_shown & (start <= end)
     ends = [a + np.where(is_shown, t, 0.0)[..., None] * (b - a) for t in (start, end)]
     return np.concatenate(ends, axis=1).clip(0.0, size), np.concatenate(
         [is_shown, is_shown], axis=1

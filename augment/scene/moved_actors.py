@@ -181,7 +181,7 @@ def move_actors(scene: Scene, tracks: Mapping[str, Track | None]) -> Scene:
     """
     check_track_ids(scene, tracks)
     actors = tuple(
-        replace(actor, track=tracks[actor.track_id] or Track.absent())
+        replace(actor, track=tracks[actor.track_id] or actor.track.as_absent())
         if actor.track_id in tracks
         else actor
         for actor in scene.actors
@@ -192,9 +192,10 @@ def move_actors(scene: Scene, tracks: Mapping[str, Track | None]) -> Scene:
 def add_actors(scene: Scene, actors: Sequence[Actor]) -> Scene:
     """Return the scene with further actors.
 
-    Their Gaussians lie in their own frames, their tracks in this scene's world. Snow on them is
-    found like that on recorded vehicles. `Actor.copy_of` names the actor of this scene that one is
-    a copy of; the trust mask then knows which of its sides were recorded.
+    Their Gaussians lie in their own frames, their tracks in this scene's world. Snow on them, below
+    them and in their wheel tracks is that of recorded vehicles on these tracks. `Actor.copy_of`
+    names the actor of this scene that one is a copy of; the trust mask then knows which of its
+    sides were recorded.
 
     Args:
         scene: the scene, recorded or moved before.
@@ -249,7 +250,9 @@ def _with_actors(
     """
     base = scene if scene.recorded is None else scene.recorded
     if len(actors) > len(base.actors):
-        absent = tuple(replace(actor, track=Track.absent()) for actor in actors[len(base.actors) :])
+        absent = tuple(
+            replace(actor, track=actor.track.as_absent()) for actor in actors[len(base.actors) :]
+        )
         base = replace(base, actors=(*base.actors, *absent))
     labels = base.labels
     if labels is not None:

@@ -20,17 +20,28 @@ def pinhole_scene(scene: Scene) -> Scene:
     """Return the scene with a pinhole camera in place of each camera with a lens or a shutter.
 
     The result is the scene itself if all its cameras are pinholes. Otherwise it is made once, and
-    shares the scene's memo, since nothing is computed with the cameras as they are.
+    shares the scene's memo, since nothing is computed with the cameras as they are. Where actors
+    were moved, the scene as it was recorded has the same pinhole cameras.
     """
+    recorded = None if scene.recorded is None else pinhole_scene(scene.recorded)
     with _lock:
         known = _scenes.get(scene)
         if known is not None:
             return known
-        frames = _pinhole_frames(scene.frames)
+        if recorded is not None and scene.recorded and scene.frames is scene.recorded.frames:
+            frames = recorded.frames
+        else:
+            frames = _pinhole_frames(scene.frames)
         seen_frames = None if scene.seen_frames is None else _pinhole_frames(scene.seen_frames)
         if frames is scene.frames and seen_frames is scene.seen_frames:
             return scene
-        changed = dataclasses.replace(scene, frames=frames, seen_frames=seen_frames)
+        changed = dataclasses.replace(
+            scene,
+            frames=frames,
+            seen_frames=seen_frames,
+            lens_frames=scene.frames,
+            recorded=recorded,
+        )
         share_memo(scene, changed)
         _scenes[scene] = changed
         return changed

@@ -29,6 +29,8 @@ from augment.scene.lenses import Intrinsics, Lens
 MAX_OFF_AXIS_DEG = 65.0
 # Largest ratio of the areas that pixels of the lens cover in one of several views.
 MAX_AREA_RATIO = 2.2
+# Power of a larger ratio by which a set of views costs more.
+_RATIO_POWER = 1.5
 # The same of a single view, which costs least. Its splats are blurred as in a pinhole picture.
 MAX_SINGLE_AREA_RATIO = 4.0
 # Width of the band in which two views are mixed: difference of the cosines to both axes.
@@ -207,8 +209,8 @@ def _choose_views(
     for columns, rows in _GRIDS:
         rotations = _spread_views(coarse_rays, coarse_inside, columns, rows)
         ratio, cost = _judge(rotations, coarse_rays, coarse_inside, intrinsics, step)
-        choices.append((max(ratio, MAX_AREA_RATIO), cost, rotations))
-    return min(choices, key=lambda choice: choice[:2])[2]
+        choices.append((cost * max(ratio / MAX_AREA_RATIO, 1.0) ** _RATIO_POWER, rotations))
+    return min(choices, key=lambda choice: choice[0])[1]
 
 
 def _spread_views(

@@ -34,7 +34,7 @@ from augment.scene.sky import Sky
 
 # Angle below which sin loses its digits; the straight line is exact there.
 _STRAIGHT_RAD = 1e-6
-# Time of the sample of a track that exists at no time: 73 years before 1970, ns.
+# Time at which the tracks of actors begin that no image shows: 73 years before 1970, ns.
 _NEVER_NS = -(1 << 61)
 
 
@@ -53,16 +53,15 @@ class Track:
     max_gap_ns: int | None = None
     """Longest time between two samples that is interpolated; None interpolates all."""
 
-    @staticmethod
-    def absent() -> Track:
-        """Return the track of an actor that exists at no time."""
-        times_ns = torch.tensor([_NEVER_NS], dtype=torch.int64)
-        return Track(times_ns, torch.eye(4, dtype=torch.float64)[None], hold_ns=0)
+    def as_absent(self) -> Track:
+        """Return the same motion before all times, of an actor that no image shows."""
+        times_ns = self.timestamps_ns - self.timestamps_ns[0] + _NEVER_NS
+        return replace(self, timestamps_ns=times_ns, hold_ns=0)
 
     @property
     def is_absent(self) -> bool:
-        """Return True for a track of `absent`."""
-        return len(self.timestamps_ns) == 1 and int(self.timestamps_ns[0]) == _NEVER_NS
+        """Return True for a track of `as_absent`."""
+        return int(self.timestamps_ns[0]) == _NEVER_NS
 
     def __post_init__(self) -> None:
         count = self.timestamps_ns.shape[0]
@@ -579,6 +578,9 @@ class Scene:
     seen_frames: tuple[Frame, ...] | None = None
     """Frames that the scene was made from, where `frames` are others (those of a camera path, or
     invented ones); empty where they are not known, None where they are `frames`."""
+    lens_frames: tuple[Frame, ...] | None = None
+    """The frames with their lenses, where `frames` have pinholes in their place
+    (`augment.scene.pinhole_scene`); else None."""
     ego_masks: Mapping[str, Bool[np.ndarray, "_ _"]] | None = None
     """Pixels of recorded images that show the recording car, by camera name, bool [H, W] at the
     size of the camera's images. A camera without a mask shows none of it; None where no masks are

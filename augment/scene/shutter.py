@@ -12,7 +12,7 @@ from typing import Literal, get_args
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from augment.scene.geometry import invert_rigid, quat_from_rotmat, rigid, rotmat_from_quat, slerp
@@ -122,6 +122,32 @@ class RollingShutter:
         identity = torch.eye(4, dtype=torch.float64)
         moved_from_camera = interpolate_pose(identity, end, abs(2 * share - 1))
         return moved_from_camera @ camera_from_world
+
+    def world_from_camera_at(
+        self, shares: Float64[np.ndarray, " N"], camera_from_world: Float[Tensor, "4 4"]
+    ) -> Float64[np.ndarray, "N 4 4"]:
+        """Return the inverse poses of `camera_at` at several shares of the read-out.
+
+        Args:
+            shares: 0 at the start, 0.5 at the middle, 1 at the end.
+            camera_from_world: pose at the middle.
+        """
+        camera_from_ends = torch.stack(
+            [
+                invert_rigid(self.start_from_camera),
+                torch.eye(4, dtype=torch.float64),
+                invert_rigid(self.end_from_camera),
+            ]
+        )
+        share = torch.from_numpy(shares)
+        first = (share >= 0.5).long()
+        part = torch.where(first == 0, 2 * share, 2 * share - 1)
+        quats = quat_from_rotmat(camera_from_ends[:, :3, :3])
+        centres = camera_from_ends[:, :3, 3]
+        quat = slerp(quats[first], quats[first + 1], part)
+        centre = centres[first] + part[:, None] * (centres[first + 1] - centres[first])
+        camera_from_moved = rigid(rotmat_from_quat(quat), centre)
+        return (invert_rigid(camera_from_world) @ camera_from_moved).numpy()
 
     def time_at_ns(self, share: float) -> int:
         """Return the time of a share of the read-out, relative to its middle, ns."""

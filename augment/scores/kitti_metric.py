@@ -17,11 +17,17 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 from augment.scores.box_overlaps_3d import overlaps_3d
+from augment.scores.coco_metric import CategoryPrecisions
 from augment.scores.matching import assign_detections, box_overlaps
 from augment.scores.predictions import ImageDetections
+from augment.scores.resampled_precision import (
+    RankedDetections,
+    SceneResampling,
+    resampled_precision,
+)
 from augment.scores.truth import ImageTruth
 
 KittiView = Literal["bbox", "bev", "3d"]
@@ -76,8 +82,9 @@ def kitti_average_precision(
     *,
     view: KittiView = "bbox",
     difficulty: Difficulty = DIFFICULTIES["moderate"],
-) -> np.ndarray:
-    """Return the AP of each category at 40 recalls, float64; NaN where no object counts.
+    resampling: SceneResampling | None = None,
+) -> CategoryPrecisions:
+    """Return the AP of each category at 40 recalls.
 
     Args:
         truths: True objects of each image.
@@ -85,30 +92,73 @@ def kitti_average_precision(
         categories: Names of the categories.
         view: Overlap of boxes in the image, from above, or in space.
         difficulty: Objects that count.
+        resampling: Resamples of the images' scenes, if wanted.
     """
-    return np.array([
-        _category_precision(truths, detections, number, min_overlap_of(name), view, difficulty)
+    rows = [
+        _match_category(truths, detections, number, min_overlap_of(name), view, difficulty)
         for number, name in enumerate(categories)
-    ])  # fmt: skip
+    ]
+    values = np.array([row.average_precision() for row in rows])
+    if resampling is None:
+        return CategoryPrecisions(values, None)
+    resampled = [row.resample(resampling) for row in rows]
+    return CategoryPrecisions(values, np.stack(resampled, axis=1))
 
 
-def _category_precision(
+@dataclass(frozen=True, eq=False)
+class _CategoryMatches:
+    """Detections of one category against its objects."""
+
+    scores: Float64[np.ndarray, " N"]
+    """Score of each detection that counts."""
+    is_hit: Bool[np.ndarray, " N"]
+    """True for detections that find an object."""
+    image_numbers: Int64[np.ndarray, " N"]
+    """Place of each detection's image among the images."""
+    num_objects: Int64[np.ndarray, " I"]
+    """Number of objects that count in each image."""
+
+    def average_precision(self) -> float:
+        """Return the AP; NaN where no object counts."""
+        count = int(self.num_objects.sum())
+        if not count:
+            return np.nan
+        return float(precision_at_recalls(self.scores, self.is_hit, count).mean())
+
+    def resample(self, resampling: SceneResampling) -> Float64[np.ndarray, " R"]:
+        """Return the AP in each resample of scenes."""
+        order = np.argsort(-self.scores, kind="stable")
+        num_scenes = resampling.weights.shape[1]
+        num_objects = np.bincount(
+            resampling.scene_numbers, weights=self.num_objects, minlength=num_scenes
+        )
+        ranked = RankedDetections(
+            self.is_hit[order],
+            _is_last_of_score(self.scores[order]),
+            resampling.scene_numbers[self.image_numbers[order]],
+            num_objects.astype(np.int64),
+        )
+        recalls = np.arange(1, NUM_RECALLS + 1) / NUM_RECALLS
+        return resampled_precision(ranked, resampling.weights, recalls)
+
+
+def _match_category(
     truths: Sequence[ImageTruth],
     detections: Sequence[ImageDetections],
     category: int,
     min_overlap: float,
     view: KittiView,
     difficulty: Difficulty,
-) -> float:
-    """Return the AP of one category."""
-    num_objects = 0
+) -> _CategoryMatches:
+    """Return the detections of one category against its objects."""
+    num_objects: list[int] = []
     scores: list[np.ndarray] = []
     hits: list[np.ndarray] = []
     for truth, image_detections in zip(truths, detections, strict=True):
         objects = np.flatnonzero(truth.categories == category)
         rows = np.flatnonzero(image_detections.categories == category)
         is_counted = counted_objects(truth, difficulty)[objects]
-        num_objects += int(is_counted.sum())
+        num_objects.append(int(is_counted.sum()))
         boxes = image_detections.boxes[rows]
         if view == "bbox":
             overlaps = box_overlaps(boxes, truth.amodal_boxes[objects])
@@ -125,9 +175,12 @@ def _category_precision(
         is_used = is_hit | ~(assignment.is_ignored | is_low)
         scores.append(image_scores[is_used])
         hits.append(is_hit[is_used])
-    if not num_objects:
-        return np.nan
-    return precision_at_recalls(np.concatenate(scores), np.concatenate(hits), num_objects).mean()
+    return _CategoryMatches(
+        np.concatenate(scores),
+        np.concatenate(hits),
+        np.repeat(np.arange(len(scores)), [len(rows) for rows in scores]),
+        np.array(num_objects, np.int64),
+    )
 
 
 def precision_at_recalls(
@@ -138,7 +191,7 @@ def precision_at_recalls(
     Detections of equal scores count together: no threshold tells them apart.
     """
     order = np.argsort(-scores, kind="stable")
-    is_last_of_score = np.append(np.diff(scores[order]) != 0, True)[: len(order)]
+    is_last_of_score = _is_last_of_score(scores[order])
     num_hits = np.cumsum(is_hit[order])[is_last_of_score]
     num_detections = np.arange(1, len(order) + 1)[is_last_of_score]
     precision = num_hits / num_detections
@@ -146,3 +199,8 @@ def precision_at_recalls(
     # Whole numbers: recall 3/10 is reached by 3 of 10 objects, whatever 0.3 is in binary.
     first = np.searchsorted(num_hits * NUM_RECALLS, np.arange(1, NUM_RECALLS + 1) * num_objects)
     return np.append(best_precision, 0.0)[first]
+
+
+def _is_last_of_score(scores: Float64[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
+    """Return True for the last of equal scores, of scores in descending order."""
+    return np.append(np.diff(scores) != 0, True)[: len(scores)]

@@ -8,7 +8,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -18,7 +17,9 @@ from augment.output.codecs import decode_png
 from augment.scene.semantics import SemanticClass
 from augment.scores.coco_metric import coco_average_precision
 from augment.scores.kitti_metric import DIFFICULTIES, KittiView, kitti_average_precision
-from augment.scores.predictions import Predictions
+from augment.scores.nuscenes_metric import NuScenesSplit, detection_score
+from augment.scores.predictions import RESULTS_FILE, Predictions
+from augment.scores.resampled_precision import SceneResampling
 from augment.scores.semantic_metric import class_overlaps, count_pixels
 from augment.scores.suite_facts import CLEAN_VARIANT, RenderedSuite
 from augment.scores.truth import SuiteTruth
@@ -31,6 +32,9 @@ class MetricValue(NamedTuple):
     """Mean over the categories that have objects, 0 to 1."""
     by_category: dict[str, float | None]
     """Value of each category; None where no object counts."""
+    resampled: np.ndarray | None = None
+    """Value in each resample of scenes, float64 [R], NaN where no object counts; None without
+    resamples."""
 
 
 @runtime_checkable
@@ -42,8 +46,18 @@ class Metric(Protocol):
         """Name of the metric, for reports and to compare baselines."""
         ...
 
-    def measure(self, predictions: Predictions, numbers: Sequence[int]) -> MetricValue:
-        """Return the metric's value on the images of some numbers."""
+    def measure(
+        self,
+        predictions: Predictions,
+        numbers: Sequence[int],
+        resampling: SceneResampling | None = None,
+    ) -> MetricValue:
+        """Return the metric's value on the images of some numbers.
+
+        Args:
+            numbers: Numbers of the images that count.
+            resampling: Resamples of the scenes of all images of the suite, if wanted.
+        """
         ...
 
 
@@ -59,14 +73,20 @@ class CocoMetric:
         """Name of the metric."""
         return "mAP@[.5:.95] (COCO)"
 
-    def measure(self, predictions: Predictions, numbers: Sequence[int]) -> MetricValue:
+    def measure(
+        self,
+        predictions: Predictions,
+        numbers: Sequence[int],
+        resampling: SceneResampling | None = None,
+    ) -> MetricValue:
         """Return mAP on the images of some numbers."""
         precisions = coco_average_precision(
             [self.truth.images[number] for number in numbers],
             [predictions.detections[number] for number in numbers],
             len(self.truth.categories),
+            _of_images(resampling, numbers),
         )
-        return mean_of_categories(precisions, self.truth.categories)
+        return mean_of_categories(*precisions, self.truth.categories)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +105,12 @@ class KittiMetric:
         """Name of the metric."""
         return f"AP|R40 {self.view} {self.difficulty} (KITTI)"
 
-    def measure(self, predictions: Predictions, numbers: Sequence[int]) -> MetricValue:
+    def measure(
+        self,
+        predictions: Predictions,
+        numbers: Sequence[int],
+        resampling: SceneResampling | None = None,
+    ) -> MetricValue:
         """Return the mean AP on the images of some numbers.
 
         Raises:
@@ -104,8 +129,9 @@ class KittiMetric:
             self.truth.categories,
             view=self.view,
             difficulty=DIFFICULTIES[self.difficulty],
+            resampling=_of_images(resampling, numbers),
         )
-        return mean_of_categories(precisions, self.truth.categories)
+        return mean_of_categories(*precisions, self.truth.categories)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,11 +149,23 @@ class SemanticMetric:
         """Name of the metric."""
         return "mIoU"
 
-    def measure(self, predictions: Predictions, numbers: Sequence[int]) -> MetricValue:
+    def measure(
+        self,
+        predictions: Predictions,
+        numbers: Sequence[int],
+        resampling: SceneResampling | None = None,
+    ) -> MetricValue:
         """Return mIoU on the images of some numbers."""
-        counts = self.count(predictions)[np.asarray(numbers, np.int64)].sum(axis=0)
+        counts = self.count(predictions)[np.asarray(numbers, np.int64)]
         names = [semantic_class.name.lower() for semantic_class in SemanticClass]
-        return mean_of_categories(class_overlaps(counts), names)
+        resampled = None
+        if resampling is not None:
+            scene_numbers = resampling.scene_numbers[np.asarray(numbers, np.int64)]
+            by_scene = np.zeros((resampling.weights.shape[1], *counts.shape[1:]), np.int64)
+            np.add.at(by_scene, scene_numbers, counts)
+            sums = np.tensordot(resampling.weights, by_scene, axes=1)
+            resampled = np.stack([class_overlaps(table) for table in sums])
+        return mean_of_categories(class_overlaps(counts.sum(axis=0)), resampled, names)
 
     def count(self, predictions: Predictions) -> np.ndarray:
         """Return the pixels of each true and predicted class, [images, true, predicted].
@@ -161,39 +199,64 @@ class SemanticMetric:
 
 @dataclass(frozen=True, eq=False)
 class NuScenesMetric:
-    """nuScenes detection score, computed by nuscenes-devkit on a whole split."""
+    """nuScenes detection score, computed by nuscenes-devkit on a split."""
 
-    root: Path
-    """Folder of the nuScenes dataset, which has the annotations."""
-    version: str
-    """Version of its tables, such as v1.0-trainval."""
-    split: str
-    """Split whose samples the predictions have, such as val or mini_val."""
+    suite: RenderedSuite
+    """The suite."""
+    split: NuScenesSplit
+    """Samples that are scored."""
+    values: dict[tuple[str, tuple[str, ...]], MetricValue] = field(default_factory=dict)
+    """Values by the hash of the predictions and the names of the scenes that do not count."""
 
     @property
     def name(self) -> str:
         """Name of the metric."""
-        return f"NDS ({self.split})"
+        return f"NDS ({self.split.split})"
 
-    def measure(self, predictions: Predictions, numbers: Sequence[int]) -> MetricValue:
-        """Return NDS on the split. The numbers of images do not matter."""
-        from augment.scores.nuscenes_metric import detection_score
+    def measure(
+        self,
+        predictions: Predictions,
+        numbers: Sequence[int],
+        resampling: SceneResampling | None = None,
+    ) -> MetricValue:
+        """Return NDS on the scenes of the images of some numbers. It has no resamples.
 
-        return MetricValue(*detection_score(predictions, self.root, self.version, self.split))
+        Raises:
+            ScoreError: The devkit is missing, or refuses the results.
+        """
+        scenes = {image.scene for image in self.suite.images}
+        omitted = tuple(sorted(scenes - {self.suite.images[number].scene for number in numbers}))
+        key = (predictions.content_hash, omitted)
+        if key not in self.values:
+            path = predictions.folder / RESULTS_FILE
+            score = detection_score(path, self.split, scenes, omitted)
+            self.values[key] = MetricValue(score.score, dict(score.by_class))
+        return self.values[key]
 
 
-def mean_of_categories(values: np.ndarray, names: Sequence[str]) -> MetricValue:
+def mean_of_categories(
+    values: np.ndarray, resampled: np.ndarray | None, names: Sequence[str]
+) -> MetricValue:
     """Return the mean over the categories that have a value; NaN if none has.
 
     Args:
-        values: Value of each category, NaN where no object counts.
+        values: Value of each category [C], NaN where no object counts.
+        resampled: The same in each resample [R, C]; None without resamples.
         names: Names of the categories.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # the mean of nothing
         mean = float(np.nanmean(values))
+        means = None if resampled is None else np.nanmean(resampled, axis=1)
     by_category = {
         name: None if np.isnan(value) else float(value)
         for name, value in zip(names, values, strict=True)
     }
-    return MetricValue(mean, by_category)
+    return MetricValue(mean, by_category, means)
+
+
+def _of_images(
+    resampling: SceneResampling | None, numbers: Sequence[int]
+) -> SceneResampling | None:
+    """Return resamples for the images of some numbers."""
+    return None if resampling is None else resampling.of_images(np.asarray(numbers, np.int64))

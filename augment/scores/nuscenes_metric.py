@@ -1,60 +1,110 @@
-"""nuScenes detection score by nuscenes-devkit, an optional package."""
+"""nuScenes detection score (NDS) by nuscenes-devkit, which a Python of its own runs.
+
+In: a file of nuScenes results and the dataset. Out: `DetectionScore`. The program that runs in that
+Python is `augment/scores/nuscenes_evaluation.py`.
+"""
 
 from __future__ import annotations
 
-import contextlib
-import importlib
-import io
 import json
+import shutil
+import subprocess
+import sys
 import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from augment.errors import ScoreError
-from augment.scores.predictions import RESULTS_FILE, Predictions
+from augment.scores import nuscenes_evaluation
 
 # The benchmark's configuration.
 CONFIGURATION = "detection_cvpr_2019"
+# Number of last characters of the program's messages that an error quotes.
+_MAX_MESSAGE = 600
+
+
+@dataclass(frozen=True)
+class NuScenesSplit:
+    """Samples of nuScenes that are scored."""
+
+    root: Path
+    """Folder of the nuScenes dataset, which has the annotations."""
+    version: str
+    """Version of its tables, such as v1.0-trainval."""
+    split: str
+    """Split whose samples the predictions have, such as val or mini_val."""
+    python: Path | None = None
+    """Python that has nuscenes-devkit; None for the one that runs this."""
+
+
+@dataclass(frozen=True)
+class DetectionScore:
+    """Scores of a file of results."""
+
+    score: float
+    """NDS, 0 to 1."""
+    by_class: dict[str, float]
+    """AP of each class, 0 to 1."""
+    errors: dict[str, float]
+    """Mean errors of true positives: `trans_err` in m, `scale_err`, `orient_err` in rad, `vel_err`
+    in m/s, `attr_err`."""
 
 
 def detection_score(
-    predictions: Predictions, root: Path, version: str, split: str
-) -> tuple[float, dict[str, float | None]]:
-    """Return NDS, and the AP of each class.
+    results: Path,
+    split: NuScenesSplit,
+    rendered_scenes: Iterable[str],
+    omitted_scenes: Iterable[str] = (),
+) -> DetectionScore:
+    """Return NDS of a file of results.
 
     Args:
-        predictions: nuScenes results of all samples of the split.
-        root: Folder of the nuScenes dataset.
-        version: Version of its tables, such as v1.0-trainval.
-        split: Name of a split, such as val or mini_val.
+        results: nuScenes results of all samples of the split.
+        split: The samples.
+        rendered_scenes: Names of the scenes that the suite has.
+        omitted_scenes: Names of the scenes that do not count.
 
     Raises:
-        ScoreError: nuscenes-devkit is not installed, or refuses the results.
+        ScoreError: The Python has no nuscenes-devkit or cannot be run, or the devkit refuses the
+            results, or the suite lacks scenes of the split.
     """
-    try:
-        nuscenes: Any = importlib.import_module("nuscenes")
-        config: Any = importlib.import_module("nuscenes.eval.common.config")
-        evaluate: Any = importlib.import_module("nuscenes.eval.detection.evaluate")
-    except ImportError as error:
-        raise ScoreError(
-            f"NDS is computed by nuscenes-devkit, which cannot be imported here ({error}); install "
-            f"it beside ClimateGS: pip install nuscenes-devkit"
-        ) from error
-    path = predictions.folder / RESULTS_FILE
-    with contextlib.redirect_stdout(io.StringIO()), tempfile.TemporaryDirectory() as folder:
-        # The devkit needs `meta` with five entries that do not change the score.
-        results = json.loads(path.read_bytes())
-        sensors = ("use_camera", "use_lidar", "use_radar", "use_map", "use_external")
-        results["meta"] = dict.fromkeys(sensors, False) | (results.get("meta") or {})
-        completed_path = Path(folder) / RESULTS_FILE
-        completed_path.write_text(json.dumps(results))
+    named_python = str(split.python or sys.executable)
+    # The program runs in another folder, where a relative path would lead elsewhere.
+    python = str(Path(shutil.which(named_python) or named_python).absolute())
+    with tempfile.TemporaryDirectory() as folder:
+        request_path = Path(folder) / "request.json"
+        answer_path = Path(folder) / "answer.json"
+        request_path.write_text(
+            json.dumps({
+                "root": str(split.root.absolute()),
+                "version": split.version,
+                "split": split.split,
+                "configuration": CONFIGURATION,
+                "results": str(results.absolute()),
+                "rendered_scenes": sorted(rendered_scenes),
+                "omitted_scenes": sorted(omitted_scenes),
+            })
+        )  # fmt: skip
+        # By its text, and not by its path: the folder of a program is searched for modules.
+        program = Path(nuscenes_evaluation.__file__).read_text()
+        command = [python, "-c", program, str(request_path), str(answer_path)]
         try:
-            tables = nuscenes.NuScenes(version=version, dataroot=str(root), verbose=False)
-            evaluation = evaluate.DetectionEval(
-                tables, config.config_factory(CONFIGURATION), str(completed_path), split,
-                output_dir=folder, verbose=False,
-            )  # fmt: skip
-            metrics, _ = evaluation.evaluate()
-        except (AssertionError, LookupError, OSError, ValueError) as error:
-            raise ScoreError(f"{path}: nuscenes-devkit refuses these results: {error}") from error
-    return float(metrics.nd_score), {k: float(ap) for k, ap in metrics.mean_dist_aps.items()}
+            done = subprocess.run(
+                command, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, check=False
+            )
+        except OSError as error:
+            raise ScoreError(f"{python} cannot be run to compute NDS: {error}") from error
+        if not answer_path.is_file():
+            text = done.stderr.decode(errors="replace").strip()[-_MAX_MESSAGE:]
+            raise ScoreError(f"{python} ended with {done.returncode} and computed no NDS: {text}")
+        answer = json.loads(answer_path.read_bytes())
+    if "missing" in answer:
+        raise ScoreError(
+            f"NDS is computed by nuscenes-devkit, which {python} cannot import "
+            f"({answer['missing']}). Install it into an environment of its own, since it needs "
+            f"another NumPy, and name its Python: --nuscenes-python PATH/bin/python"
+        )
+    if "refused" in answer:
+        raise ScoreError(f"{results}: nuscenes-devkit gives no NDS: {answer['refused']}")
+    return DetectionScore(**answer)

@@ -7,7 +7,7 @@ probes, baseline.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -33,6 +33,7 @@ from augment.scores.metric_values import (
     NuScenesMetric,
     SemanticMetric,
 )
+from augment.scores.nuscenes_metric import NuScenesSplit
 from augment.scores.predictions import (
     ExpectedImages,
     PredictionKind,
@@ -49,8 +50,15 @@ from augment.scores.recall import (
     match_image,
     recall_by,
 )
+from augment.scores.resampled_precision import SceneResampling
+from augment.scores.resampled_scores import (
+    NUM_METRIC_RESAMPLES,
+    ResampledEffect,
+    ResampledValues,
+    add_intervals,
+)
 from augment.scores.robustness import EffectValues, summarize
-from augment.scores.scene_bootstrap import recall_interval
+from augment.scores.scene_bootstrap import recall_interval, resample_scenes
 from augment.scores.suite_facts import CLEAN_VARIANT, RenderedSuite, list_names, read_suite
 from augment.scores.suite_scores import (
     EffectScores,
@@ -89,12 +97,8 @@ class ScoreOptions:
     """Overlap of KITTI's AP."""
     kitti_difficulty: str = "moderate"
     """Difficulty of KITTI's AP: easy, moderate or hard."""
-    nuscenes_root: Path | None = None
-    """Folder of nuScenes, for NDS."""
-    nuscenes_version: str = "v1.0-trainval"
-    """Version of its tables."""
-    nuscenes_split: str = "val"
-    """Split whose samples the predictions have."""
+    nuscenes: NuScenesSplit | None = None
+    """Samples of nuScenes, for NDS."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,14 +135,17 @@ def score_suite(
         OutputError: The suite is missing or damaged.
     """
     run = _open_run(read_suite(store), folder, options)
-    scores = _make_scores(run, folder)
-    if baseline is None:
-        return scores
-    if baseline.is_dir():
-        base_scores = _make_scores(_open_run(run.suite, baseline, options), baseline)
-    else:
-        base_scores = read_scores(baseline)
-    return add_baseline(scores, base_scores, str(baseline))
+    scores, values = _make_scores(run, folder)
+    base_values = None
+    if baseline is not None:
+        if baseline.is_dir():
+            base_scores, base_values = _make_scores(
+                _open_run(run.suite, baseline, options), baseline
+            )
+        else:
+            base_scores = read_scores(baseline)
+        scores = add_baseline(scores, base_scores, str(baseline))
+    return scores if values is None else add_intervals(scores, values, base_values)
 
 
 def add_baseline(scores: SuiteScores, baseline: SuiteScores, where: str) -> SuiteScores:
@@ -156,6 +163,7 @@ def add_baseline(scores: SuiteScores, baseline: SuiteScores, where: str) -> Suit
     effects = {
         name: effect.model_copy(
             update={
+                "levels": _differences(effect, baseline.effects[name]),
                 "corruption_error": effect.values.corruption_error(base_values[name]),
                 "relative_gain": effect.values.relative_gain(base_values[name]),
             }
@@ -172,6 +180,15 @@ def add_baseline(scores: SuiteScores, baseline: SuiteScores, where: str) -> Suit
             "baseline": where,
             "warnings": (*scores.warnings, *warnings),
         }
+    )
+
+
+def _differences(effect: EffectScores, baseline: EffectScores) -> tuple[LevelScore, ...]:
+    """Return the levels of an effect with the metric less the baseline's."""
+    pairs = zip(effect.levels, baseline.levels, strict=True)
+    return tuple(
+        level.model_copy(update={"difference": level.metric - base_level.metric})
+        for level, base_level in pairs
     )
 
 
@@ -257,33 +274,64 @@ def _choose_metric(
         return KittiMetric(truth, options.kitti_view, options.kitti_difficulty)
     if kind == "semantic":
         return SemanticMetric(suite)
-    if options.nuscenes_root is None:
+    if options.nuscenes is None:
         raise ScoreError("nuScenes results need the dataset's annotations: --nuscenes PATH")
-    return NuScenesMetric(options.nuscenes_root, options.nuscenes_version, options.nuscenes_split)
+    return NuScenesMetric(suite, options.nuscenes)
 
 
-def _make_scores(run: _Run, folder: Path) -> SuiteScores:
-    """Return the scores of a network without a baseline."""
+def _resample_images(suite: RenderedSuite) -> SceneResampling | None:
+    """Return resamples of the scenes of all images; None with a single scene."""
+    names, scene_numbers = np.unique([image.scene for image in suite.images], return_inverse=True)
+    if len(names) < 2:
+        return None
+    rng = np.random.default_rng(BOOTSTRAP_SEED)
+    weights = resample_scenes(len(names), rng, NUM_METRIC_RESAMPLES)
+    return SceneResampling(scene_numbers, weights)
+
+
+def _resampled_values(
+    clean: MetricValue, cleans: Mapping[str, MetricValue], levels: Mapping[str, list[MetricValue]]
+) -> ResampledValues | None:
+    """Return a metric in each resample; None without resamples.
+
+    Args:
+        clean: Value on all clean renders.
+        cleans: Value on the clean renders that count for each effect.
+        levels: Values at the levels of each effect.
+    """
+    if clean.resampled is None:
+        return None
+    effects = {}
+    for effect, of_effect in levels.items():
+        clean_resampled = cleans[effect].resampled
+        by_level = [measured.resampled for measured in of_effect if measured.resampled is not None]
+        assert clean_resampled is not None and len(by_level) == len(of_effect), "of one metric"
+        effects[effect] = ResampledEffect(clean_resampled, np.stack(by_level))
+    return ResampledValues(clean.resampled, effects)
+
+
+def _make_scores(run: _Run, folder: Path) -> tuple[SuiteScores, ResampledValues | None]:
+    """Return the scores of a network without a baseline, and its metric in each resample."""
     suite = run.suite
+    resampling = _resample_images(suite)
     all_numbers = suite.numbers_of(None)
-    clean = run.metric.measure(run.predictions[CLEAN_VARIANT], all_numbers)
+    clean = run.metric.measure(run.predictions[CLEAN_VARIANT], all_numbers, resampling)
     clean_by_numbers = {all_numbers: clean}
     for effect in run.effects:
         numbers = suite.numbers_of(effect)
         if numbers not in clean_by_numbers:
-            measured = run.metric.measure(run.predictions[CLEAN_VARIANT], numbers)
+            measured = run.metric.measure(run.predictions[CLEAN_VARIANT], numbers, resampling)
             clean_by_numbers[numbers] = measured
+    cleans = {effect: clean_by_numbers[suite.numbers_of(effect)] for effect in run.effects}
     levels = {
         effect: [
-            run.metric.measure(run.predictions[name], suite.numbers_of(effect)) for name in names
+            run.metric.measure(run.predictions[name], suite.numbers_of(effect), resampling)
+            for name in names
         ]
         for effect, names in run.effects.items()
     }
     values = {
-        effect: EffectValues(
-            clean_by_numbers[suite.numbers_of(effect)].value,
-            tuple(measured.value for measured in of_effect),
-        )
+        effect: EffectValues(cleans[effect].value, tuple(measured.value for measured in of_effect))
         for effect, of_effect in levels.items()
     }
     summary = summarize(values)
@@ -296,7 +344,7 @@ def _make_scores(run: _Run, folder: Path) -> SuiteScores:
             suite, values[effect].clean, dict(zip(names, values[effect].levels, strict=True))
         )
     ]
-    return SuiteScores(
+    scores = SuiteScores(
         suite=suite.name,
         suite_sha256=suite.content_hash,
         images_sha256=suite.images_hash,
@@ -330,6 +378,7 @@ def _make_scores(run: _Run, folder: Path) -> SuiteScores:
         warnings=tuple(warnings),
         notes=tuple(_notes(run)),
     )
+    return scores, _resampled_values(clean, cleans, levels)
 
 
 def _effect_scores(
@@ -569,10 +618,6 @@ def _notes(run: _Run) -> list[str]:
     for effect in suite.effects:
         if effect not in run.effects and not suite.numbers_of(effect):
             notes.append(f"{effect} has no score: every scene was recorded in it")
-    if len({image.scene for image in suite.images}) == 1 and run.hits:
-        notes.append("one scene: V50 has no interval, which would be a bootstrap by scene")
-    if run.predictions[CLEAN_VARIANT].kind == "nuscenes":
-        notes.append(
-            "NDS is over the whole split: scenes that were recorded in an effect count, too"
-        )
+    if len({image.scene for image in suite.images}) == 1:
+        notes.append("one scene: scores have no interval, which would be a bootstrap by scene")
     return notes

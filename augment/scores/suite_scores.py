@@ -10,6 +10,9 @@ from augment.errors import ScoreError
 from augment.output.atomic import read_file
 from augment.scores.robustness import EffectValues
 
+# Lower and upper end.
+Interval = tuple[float, float]
+
 
 class _Closed(BaseModel):
     """Base of the parts of the file."""
@@ -30,13 +33,19 @@ class LevelScore(_Closed):
     """The effect's physical number."""
     metric: float
     """The metric, 0 to 1."""
+    metric_interval: Interval | None = None
+    """Its interval of 95 %, a bootstrap by scene; None with a single scene, and for NDS."""
+    difference: float | None = None
+    """The metric less the baseline's; None without a baseline."""
+    difference_interval: Interval | None = None
+    """Its interval of 95 %, in pairs; None where the baseline's predictions are not known."""
     ability: float
     """RA: the metric over that on the clean renders of the same scenes."""
     by_category: dict[str, float | None]
     """The metric by category; None where no object counts."""
     recall: float | None
     """Share of the objects that are found at the clean threshold; None for semantics and NDS."""
-    recall_interval: tuple[float, float] | None
+    recall_interval: Interval | None
     """Its interval of 95 %, a bootstrap by scene; None with a single scene."""
     false_per_image: float | None
     """False positives per image at the clean threshold."""
@@ -71,10 +80,16 @@ class EffectScores(_Closed):
     """Scores by level, mildest first."""
     resilience: float
     """RR: sum over the levels, over the number of levels times the clean value."""
+    resilience_interval: Interval | None = None
+    """Its interval of 95 %."""
     corruption_error: float | None
     """CE against the baseline."""
+    corruption_error_interval: Interval | None = None
+    """Its interval of 95 %, in pairs."""
     relative_gain: float | None
     """RRA against the baseline."""
+    relative_gain_interval: Interval | None = None
+    """Its interval of 95 %, in pairs."""
     half_recall: HalfRecallScore | None
     """V50; None for effects without a physical number, semantics and NDS."""
 
@@ -151,16 +166,28 @@ class RobustnessScores(_Closed):
 
     mpc: float
     """mPC: mean of the metric over effects and levels."""
+    mpc_interval: Interval | None = None
+    """Its interval of 95 %."""
     rpc: float
     """rPC: mPC over the clean value."""
+    rpc_interval: Interval | None = None
+    """Its interval of 95 %."""
     mrr: float
     """mRR: mean resilience."""
+    mrr_interval: Interval | None = None
+    """Its interval of 95 %."""
     mra: float
     """mRA: mean resilience ability."""
+    mra_interval: Interval | None = None
+    """Its interval of 95 %."""
     mce: float | None
     """mCE against the baseline; less is better."""
+    mce_interval: Interval | None = None
+    """Its interval of 95 %."""
     mrra: float | None
     """mRRA against the baseline; more is better."""
+    mrra_interval: Interval | None = None
+    """Its interval of 95 %."""
 
 
 class SuiteScores(_Closed):
@@ -190,6 +217,8 @@ class SuiteScores(_Closed):
     """Clean threshold: the confidence at which F1 on the clean renders is largest."""
     clean: float
     """The metric on all clean renders (clean-rendered)."""
+    clean_interval: Interval | None = None
+    """Its interval of 95 %, a bootstrap by scene; None with a single scene, and for NDS."""
     clean_by_category: dict[str, float | None]
     """The same by category."""
     clean_recall: float | None

@@ -15,6 +15,7 @@ from augment.jobs.blocks import read_status
 from augment.jobs.generate import GenerateJob, GenerateResult, run_generate
 from augment.output.manifest import read_manifest_rows
 from augment.output.store import Store, open_store
+from augment.suite.mirrored_files import find_mirrored_files
 from augment.suite.suite_file import (
     SUITE_FILE,
     SuiteFile,
@@ -144,9 +145,13 @@ def run_suite(
     if not is_finished(store, run.recipes.job.name):
         return SuiteResult(images, None)
     before_hashes()
-    sources = sorted({*read_manifest_rows(store)["source"].to_pylist()})
-    conditions = {source: run.conditions_of(source) for source in sources}
-    suite_file = describe_suite(store, request._replace(conditions=conditions))
+    rows = read_manifest_rows(store).select(["source", "recipe", "variant"]).to_pylist()
+    conditions = {source: run.conditions_of(source) for source in {row["source"] for row in rows}}
+    recipe_names = {variant.name for variant in run.recipes.suite.variants}
+    variants = {row["variant"] for row in rows if row["recipe"] in recipe_names}
+    suite_file = describe_suite(
+        store, request._replace(conditions=conditions), find_mirrored_files(store, variants)
+    )
     store.write(SUITE_FILE, suite_file.to_json())
     return SuiteResult(images, suite_file)
 

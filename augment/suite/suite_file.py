@@ -212,8 +212,15 @@ def check_same_suite(store: Store, request: SuiteRequest) -> None:
             )
 
 
-def describe_suite(store: Store, request: SuiteRequest) -> SuiteFile:
+def describe_suite(
+    store: Store, request: SuiteRequest, other_paths: Iterable[str] = ()
+) -> SuiteFile:
     """Return the facts of all images of a suite in an output, and hash its files.
+
+    Args:
+        store: The output.
+        request: Facts that the images do not state.
+        other_paths: Paths of files that belong to the suite besides those of its variants.
 
     Raises:
         OutputError: A file of the manifest is missing, or nothing is finished.
@@ -249,7 +256,7 @@ def describe_suite(store: Store, request: SuiteRequest) -> SuiteFile:
             for row in rows
             if row["status"] != OK
         ),
-        files=hash_files(store, _suite_paths(store, ok_rows)),
+        files=hash_files(store, [*_suite_paths(store, ok_rows), *other_paths]),
     )
 
 

@@ -9,7 +9,8 @@ from augment.output.names import STATE_FOLDER
 from augment.output.store import Store
 from augment.suite.suite_file import SUITE_FILE, SuiteFile, hash_files, read_suite_file
 
-# Folders that hold no file of a suite: the jobs' state, and copies of datasets.
+# Folders in which other files are no concern of a suite: the jobs' state, and copies of datasets,
+# most of whose files are the dataset's own.
 _OTHER_FOLDERS = (f"{STATE_FOLDER}/", f"{MIRROR_FOLDER}/")
 
 

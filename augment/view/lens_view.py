@@ -46,10 +46,13 @@ class ViewPicture:
     """Pixels of a recorded picture that show the recording car; None where it shows none."""
     is_inside: Bool[np.ndarray, "H W"] | None = None
     """Pixels that see something through the lens; None if all do."""
+    photo_rgb: Float32[np.ndarray, "H W 3"] | None = None
+    """The recorded image before any weather, in the colours of `rgb`; None without one."""
 
 
-# Function that draws the picture of a pinhole camera, with a factor of the rasteriser's blur.
-DrawPinhole = Callable[[Camera, float], ViewPicture]
+# Function that draws the picture of a pinhole camera, with a factor of the rasteriser's blur, and
+# the camera without shutter through whose lens the picture is looked at.
+DrawPinhole = Callable[[Camera, float, Camera], ViewPicture]
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,10 +109,10 @@ def strips_of(camera: Camera, num_strips: int) -> tuple[Strip, ...]:
 def _draw_lens(camera: Camera, draw: DrawPinhole) -> ViewPicture:
     """Return the picture of a camera without shutter, through its lens if it has one."""
     if camera.lens is None:
-        return draw(camera, 1.0)
+        return draw(camera, 1.0, camera)
     with timed("lens: layout"):
         layout = layout_of(camera)
-    pictures = [draw(view.camera_for(camera), view.blur_gain) for view in layout.views]
+    pictures = [draw(view.camera_for(camera), view.blur_gain, camera) for view in layout.views]
     with timed("lens"):
         return _merge(layout, pictures, is_along_ray=camera.lens.is_depth_along_ray)
 
@@ -126,11 +129,8 @@ def _merge(
         pictures: their pictures.
         is_along_ray: if True, depth is the distance along the ray, else z.
     """
-    rgb = np.zeros((*layout.is_inside.shape, 3), np.float32)
-    for view, picture in zip(layout.views, pictures, strict=True):
-        image = np.ascontiguousarray(picture.rgb)
-        with kernel_threads(_PIXELS_PER_THREAD):
-            add_view(image, view.pixels, view.weights, np.float32(SAMPLE_SLACK), rgb)
+    rgb = _mix_views(layout, [picture.rgb for picture in pictures])
+    photos = [picture.photo_rgb for picture in pictures if picture.photo_rgb is not None]
     look_up = _Lookup.of(layout)
     images = [picture.images for picture in pictures]
     mask_names = dict.fromkeys(name for view_images in images for name in view_images.masks)
@@ -148,10 +148,28 @@ def _merge(
             scene_depth_m=look_up.depth([i.scene_depth_m for i in images], is_along_ray),
             masks={name: mask for name, mask in masks.items() if mask is not None},
         ),
+        photo_rgb=_mix_views(layout, photos) if photos else None,
         trust=look_up.nearest([picture.trust for picture in pictures]),
         own_car=look_up.nearest([picture.own_car for picture in pictures]),
         is_inside=None if layout.is_inside.all() else layout.is_inside,
     )
+
+
+def _mix_views(
+    layout: LensLayout, images: Sequence[Float32[np.ndarray, "_ _ 3"]]
+) -> Float32[np.ndarray, "H W 3"]:
+    """Return the colours at the pixels of the lens.
+
+    Args:
+        layout: the views.
+        images: their colours.
+    """
+    rgb = np.zeros((*layout.is_inside.shape, 3), np.float32)
+    for view, image in zip(layout.views, images, strict=True):
+        pixels = np.ascontiguousarray(image)
+        with kernel_threads(_PIXELS_PER_THREAD):
+            add_view(pixels, view.pixels, view.weights, np.float32(SAMPLE_SLACK), rgb)
+    return rgb
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +217,7 @@ class _Lookup:
         return out
 
     def depth(
-        self, images: Sequence[Float32[np.ndarray, "h w"] | None], is_along_ray: bool
+        self, images: Sequence[Float32[np.ndarray, "_ _"] | None], is_along_ray: bool
     ) -> Float32[np.ndarray, "H W"] | None:
         """Return the depth at the lens's pixels, 0 where there is none.
 
@@ -233,7 +251,7 @@ def _join(
         size: height and width of the whole image.
     """
 
-    def join(images: Sequence[np.ndarray | None], value: float = 0) -> np.ndarray | None:
+    def join(images: Sequence[np.ndarray | None], value: int = 0) -> np.ndarray | None:
         first = next((image for image in images if image is not None), None)
         if first is None:
             return None
@@ -258,6 +276,7 @@ def _join(
             scene_depth_m=join([i.scene_depth_m for i in images]),
             masks={name: mask for name, mask in masks.items() if mask is not None},
         ),
+        photo_rgb=join([picture.photo_rgb for picture in pictures]),
         trust=join([picture.trust for picture in pictures]),
         own_car=join([picture.own_car for picture in pictures]),
         is_inside=join([picture.is_inside for picture in pictures], value=1.0),

@@ -28,11 +28,12 @@ from augment.light.common_exposure import added_colors
 from augment.light.sky_gloss import GreyedGloss, find_sky_gloss
 from augment.output.layout import TRUST
 from augment.photo.greyed_photo import SMALL_PX, grey_photo
+from augment.photo.lens_photo import open_lens_photo, scene_colors, transfer_change
 from augment.photo.own_car import OwnCar, own_car_in_view
 from augment.photo.own_car_snow import cover_own_car
 from augment.photo.parked_objects import ObjectBox, ParkedObjects
 from augment.photo.photo_objects import copy_size
-from augment.photo.recorded_base import mix, open_photo, splat_classes
+from augment.photo.recorded_base import PhotoView, mix, open_photo, splat_classes
 from augment.photo.trust import trust_mask
 from augment.render.backends import choose_backend, renders_on_gpu
 from augment.render.buffers import AUTO, CPU, EXPECTED_DEPTH, SPLAT_IDS, RenderOutput
@@ -155,7 +156,13 @@ class _Drawing:
 
 
 def _draw_scene(
-    scene: Scene, camera: Camera, plan: Plan, *, backend: str, is_behind_lens: bool = True
+    scene: Scene,
+    camera: Camera,
+    plan: Plan,
+    *,
+    backend: str,
+    is_behind_lens: bool = True,
+    photo_view: PhotoView | None = None,
 ) -> _Drawing:
     """Return the picture of a view before the camera's sensor.
 
@@ -165,6 +172,7 @@ def _draw_scene(
         plan: the plan of all views.
         backend: as for `rasterize`.
         is_behind_lens: if False, effects on the glass before the lens are left out.
+        photo_view: the recorded image in this view of it; None if the image is the camera's own.
     """
     with timed("view plan"):
         view = plan_view(plan, scene, camera, backend=backend)
@@ -186,7 +194,9 @@ def _draw_scene(
             finds_sky = plan.depth_buffer is not None or any(
                 not effect.hooks.adds_overlays for effect in view.effects
             )
-            photo = open_photo(scene, camera, color_map, backend=backend, finds_sky=finds_sky)
+            photo = open_photo(
+                scene, camera, color_map, backend=backend, finds_sky=finds_sky, view=photo_view
+            )
     layers = LayerRenderer(bare_parts, scene.sky, None, False, plan.settings, backend, photo)
     if photo is not None:
         layers = replace(layers, parked=partial(_parked_objects, scene, bare_parts[0].gaussians))
@@ -314,12 +324,30 @@ def _render_lens_view(
         backend: as for `rasterize`.
     """
     drawings = list[_Drawing]()
+    lens_photo = None
+    if plan.is_on_photo:
+        with timed("photo"):
+            lens_photo = open_lens_photo(scene, camera)
 
-    def draw(view_camera: Camera, blur_gain: float) -> ViewPicture:
+    def draw(view_camera: Camera, blur_gain: float, lens_camera: Camera) -> ViewPicture:
+        photo_view = None
+        photo_rgb = None
+        if lens_photo is not None:
+            with timed("photo"):
+                photo_view = PhotoView(
+                    lens_photo.pixels_in(lens_camera, view_camera), lens_photo.frame, lens_camera
+                )
+                color_map = scene.color_map(camera) if plan.uses_recorded_exposure else None
+                photo_rgb = scene_colors(photo_view.pixels, color_map)
         blur_px2 = plan.settings.blur_px2 * blur_gain
         plan_of_view = replace(plan, settings=replace(plan.settings, blur_px2=blur_px2))
         drawing = _draw_scene(
-            scene, view_camera, plan_of_view, backend=backend, is_behind_lens=False
+            scene,
+            view_camera,
+            plan_of_view,
+            backend=backend,
+            is_behind_lens=False,
+            photo_view=photo_view,
         )
         drawings.append(drawing)
         rendered = drawing.rendered
@@ -343,6 +371,7 @@ def _render_lens_view(
             start_images(buffers, plan)(),
             trust=trust_mask(scene, view_camera, backend=backend) if has_trust else None,
             own_car=None if own_car is None else own_car.mask,
+            photo_rgb=photo_rgb,
         )
 
     picture = draw_through_lens(camera, recipe.render.shutter_strips, draw)
@@ -361,15 +390,20 @@ def _render_lens_view(
     view = replace(first.view, effects=effects_in_view)
     image_camera = camera.without_lens()
     masks = {name: torch.from_numpy(mask) > 0 for name, mask in picture.images.masks.items()}
+    picture_rgb = picture.rgb
+    if lens_photo is not None and picture.photo_rgb is not None:
+        with timed("photo"):
+            recorded_rgb = scene_colors(lens_photo.pixels, first.color_map)
+            picture_rgb = transfer_change(picture_rgb, picture.photo_rgb, recorded_rgb)
     rendered = RenderedView(
-        torch.from_numpy(picture.rgb), RenderOutput(), first.rendered.layers, masks=masks
+        torch.from_numpy(picture_rgb), RenderOutput(), first.rendered.layers, masks=masks
     )
     glass_effects = [effect for effect in view.effects if is_on_glass(effect)]
     for effect in glass_effects:
         rendered = _edit_image(view, effect, rendered, image_camera, first.color_map)
     rendered = _record_picture(scene, image_camera, plan, view, rendered, first.color_map, backend)
     rgb = rendered.rgb.detach()
-    if picture.is_inside is not None:
+    if picture.is_inside is not None and lens_photo is None:
         rgb = torch.where(torch.from_numpy(picture.is_inside)[..., None], rgb, 0.0)
     luminance = rendered.luminance_cd_m2
     images = replace(

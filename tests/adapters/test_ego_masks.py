@@ -18,6 +18,7 @@ from augment.errors import AdapterError, ClimateGSError
 from augment.photo.own_car import own_car_mask
 from recipes.job import JobScene
 from tests.adapters import drives
+from tests.streets import SMALL_STREET
 from tools.options import with_ego_masks_key
 
 SIZE = (160, 120)
@@ -120,7 +121,7 @@ def test_a_scene_and_its_fit_take_stated_masks_first(scene, tmp_path):
 def test_a_uri_names_masks_which_its_digest_counts(tmp_path):
     masks = tmp_path / "masks"
     write(masks, "front.json", {"polygons": [BONNET]})
-    street = "procedural:street?seed=3&frames=2"
+    street = SMALL_STREET
     scene = open_scene(f"{street}&ego_masks={masks}")
     assert scene.ego_masks is not None and list(scene.ego_masks) == ["front"]
     again = open_scene(scene.source)

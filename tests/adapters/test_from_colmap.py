@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from adapters.raw_drive import DriveOptions
-from adapters.recording.adapter import read_recording
+from adapters.recording.adapter import back_project, read_recording
 from adapters.recording.from_colmap import record_colmap
 from augment.errors import AdapterError
 
@@ -147,6 +147,29 @@ def test_images_lose_their_distortion_and_depth_lies_between_the_points(project,
     # A lane of points every half a metre, on a plane that is right to a centimetre.
     error = np.abs(depth[near] / ground[near] - 1)
     assert np.median(error) < 0.01 and np.quantile(error, 0.9) < 0.05
+
+
+def test_images_and_lens_are_kept_on_request(project, tmp_path):
+    out = tmp_path / "drive"
+    record(project, out, camera_height_m=1.51, keeps_lens=True)
+    query = {"lens": "recorded"}
+    drive, _ = read_recording(str(out), query, DriveOptions.from_query("recording", query))
+    assert drive.recorded_frames is not None
+    frame = drive.recorded_frames[3]
+    camera = frame.cameras["camera"]
+    source = project / "frames/000003.jpg"
+    assert Path(frame.image_paths["camera"]).read_bytes() == source.read_bytes()
+    xy = np.array([[0.3, -0.2], [-0.4, 0.1], [0.05, 0.25]])
+    pixels, _ = camera.lens.project(np.column_stack([xy, np.ones(3)]), camera.intrinsics)
+    np.testing.assert_allclose(pixels, distorted(xy), atol=1e-9)
+    # The depth image has the lens of the image: points on the ground lie at the road's height.
+    steps = cv2.imread(str(out / "depth/camera/000003.png"), cv2.IMREAD_UNCHANGED)
+    points = back_project(steps / np.float32(256), camera).points
+    near = points[(np.linalg.norm(points - camera.centre.numpy(), axis=1) < 12)]
+    assert len(near) > 1000
+    assert np.median(np.abs(near[:, 2])) < 0.03
+    # The scene is made from undistorted copies, whose cameras are pinholes.
+    assert drive.frames[3].cameras["camera"].is_pinhole
 
 
 def test_a_radial_lens_without_distortion_keeps_its_images(tmp_path, monkeypatch):

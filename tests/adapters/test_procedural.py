@@ -54,6 +54,7 @@ from augment.render.rasterize import rasterize
 from augment.scene.scene import Scene
 from augment.scene.semantics import SemanticClass
 from tests.adapters.shown import assert_same_bits
+from tests.streets import open_street
 
 QUERY = {"seed": "3", "width": "480", "height": "270"}
 
@@ -89,7 +90,8 @@ def test_canonical_uri_opens_the_same_parameters():
     assert parse_parameters(dict(pair.split("=") for pair in text.split("&"))) == parameters
 
 
-def test_same_query_gives_the_same_bits_and_another_seed_does_not(scene):
+def test_same_query_gives_the_same_bits_and_another_seed_does_not():
+    scene = open_street()
     state = torch.random.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
     build_street.cache_clear()
     build_sky.cache_clear()

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from adapters.base import open_scene
 from augment import render_view
 from augment.effects.lidar.beam import DEFAULT_MODEL, Echoes
 from augment.effects.lidar.codes import SCATTERED
@@ -41,6 +40,7 @@ from recipes.moment import SceneTimes
 from tests.augment.box_views import UPRIGHT, make_boxes, make_camera, placed
 from tests.lidar_sweeps import SENSOR_M, WORLD_ORIGIN_M, some_points, sweep_of
 from tests.scenes import camera_ahead, random_gaussians, random_pose
+from tests.streets import open_street
 
 GREY = (0.7, 0.7, 0.7)
 PATCHY = FogBanks(0.7, 300.0, 0.4, 20.0, 5)
@@ -221,7 +221,7 @@ def test_patchiness_zero_is_the_plain_recipe_to_the_bit_and_in_its_hash():
     )
     assert plain.resolve(0).hash == zero.resolve(0).hash
     windy = zero.resolve(0)
-    scene = open_scene(STREET)
+    scene = open_street(STREET)
     camera = scene.frames[1].cameras["front"]
     assert torch.equal(
         torch.as_tensor(np.asarray(render_view(scene, camera, plain.resolve(0)).rgb)),
@@ -239,7 +239,7 @@ def patchy_recipe(clock_s: float = 0, **fields):
 
 
 def test_images_of_a_scene_agree_on_the_field_and_change_with_time():
-    scene = open_scene(STREET)
+    scene = open_street(STREET)
     camera = scene.frames[0].cameras["front"]
     first = np.asarray(render_view(scene, camera, patchy_recipe(0)).rgb)
     again = np.asarray(render_view(scene, camera, patchy_recipe(0)).rgb)
@@ -256,7 +256,7 @@ def test_every_pass_takes_banks(scale_height, model):
     recipe = patchy_recipe(
         model=model, overcast=0.5, scatter=1, blend="linear", shadow_fade=1, **extra
     )
-    scene = open_scene(STREET)
+    scene = open_street(STREET)
     view = render_view(scene, scene.frames[0].cameras["front"], recipe)
     assert np.isfinite(np.asarray(view.rgb)).all()
 

@@ -36,7 +36,7 @@ def light(**fields: object) -> Recipe:
 
 @pytest.fixture(scope="module")
 def street() -> Scene:
-    return open_fast_street()
+    return open_fast_street(has_wet_ground=True)
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def test_a_picture_is_the_same_alone_in_sequence_and_of_a_fresh_scene(street) ->
     sequence = [view.rgb for view in render_views(street, cameras, recipe)]
     for camera, rgb in reversed(list(zip(cameras, sequence, strict=True))):
         assert np.array_equal(render_view(street, camera, recipe).rgb, rgb)
-    fresh = open_fast_street()
+    fresh = open_fast_street(has_wet_ground=True)
     assert np.array_equal(render_view(fresh, cameras[-1], recipe).rgb, sequence[-1])
 
 

@@ -197,7 +197,7 @@ def test_other_processes_take_the_changes_over():
 
 def test_wet_ground_mirrors_what_recorded_views_would_not_miss():
     """From under the ground more is seen than from above: the sky would shine through."""
-    scene = open_street()
+    scene = open_street(has_wet_ground=True)
     camera = scene.frames[0].cameras["front"].scaled(0.2)
     dry, wet = (
         [

@@ -104,12 +104,14 @@ def test_kitti_precision_worked_by_hand():
     wrong_box = [700, 300, 760, 360]
     detections = make_detections([SQUARES[0], wrong_box, SQUARES[1]], [0.9, 0.8, 0.7])
     # (10 x 1 + 10 x 2/3) / 40
-    assert kitti_average_precision([truth], [detections], ["Car"])[0] == pytest.approx(5 / 12)
+    assert kitti_average_precision([truth], [detections], ["Car"]).values[0] == pytest.approx(
+        5 / 12
+    )
     # A car needs an overlap of 0.7, a pedestrian of 0.5: 45 of 60 x 60 is 0.6.
     shifted = make_detections([[15, 100, 75, 160]], [0.9])
     one = [make_truth(SQUARES[:1])]
-    assert kitti_average_precision(one, [shifted], ["Car"])[0] == 0.0
-    assert kitti_average_precision(one, [shifted], ["Pedestrian"])[0] == 1.0
+    assert kitti_average_precision(one, [shifted], ["Car"]).values[0] == 0.0
+    assert kitti_average_precision(one, [shifted], ["Pedestrian"]).values[0] == 1.0
 
 
 def slow_precision(truths, detections) -> float:
@@ -153,7 +155,7 @@ def test_kitti_precision_equals_its_definition_on_random_detections():
         rows = boxes[rng.integers(0, 5, 8)] + rng.normal(0, 3, (8, 4))
         is_high = rows[:, 3] - rows[:, 1] >= 25  # lower ones are ignored where they find nothing
         detections.append(make_detections(rows[is_high], rng.uniform(0, 1, is_high.sum())))
-    ours = kitti_average_precision(truths, detections, ["Car"])[0]
+    ours = kitti_average_precision(truths, detections, ["Car"]).values[0]
     assert 0.05 < ours < 0.95
     assert ours == pytest.approx(slow_precision(truths, detections), abs=1e-12)
 
@@ -163,10 +165,10 @@ def test_kitti_ignores_objects_of_harder_classes_and_low_detections():
     truth = make_truth([SQUARES[0], low])
     low_miss = [600, 100, 660, 120]
     detections = make_detections([SQUARES[0], low, low_miss], [0.5, 0.9, 0.8])
-    assert kitti_average_precision([truth], [detections], ["Car"])[0] == 1.0
+    assert kitti_average_precision([truth], [detections], ["Car"]).values[0] == 1.0
     hard_only = make_truth(SQUARES[:1], truncated=0.4)
     precisions = [
-        kitti_average_precision([hard_only], [detections], ["Car"], difficulty=difficulty)[0]
+        kitti_average_precision([hard_only], [detections], ["Car"], difficulty=difficulty).values[0]
         for difficulty in DIFFICULTIES.values()
     ]
     assert np.isnan(precisions[:2]).all()
@@ -181,8 +183,13 @@ def test_kitti_in_space_counts_the_turn_and_the_height():
     cases = ((box, 1.0, 1.0), (turned, 1.0, 1.0), (raised, 0.0, 1.0))
     for other, in_space, from_above in cases:
         detections = [make_detections(SQUARES[:1], [0.9], boxes_3d=[other])]
-        assert kitti_average_precision([truth], detections, ["Car"], view="3d")[0] == in_space
-        assert kitti_average_precision([truth], detections, ["Car"], view="bev")[0] == from_above
+        assert (
+            kitti_average_precision([truth], detections, ["Car"], view="3d").values[0] == in_space
+        )
+        assert (
+            kitti_average_precision([truth], detections, ["Car"], view="bev").values[0]
+            == from_above
+        )
 
 
 def test_overlap_in_space_worked_by_hand():
@@ -228,7 +235,7 @@ def test_coco_precision_worked_by_hand():
     detections = make_detections(
         [SQUARES[0], SQUARES[1], [600, 300, 660, 360]], [0.9, 0.7, 0.8], categories=[0, 0, 0]
     )
-    precisions = coco_average_precision([truth], [detections], 3)
+    precisions = coco_average_precision([truth], [detections], 3).values
     # 101 recalls: precision 1 at 0 ... 0.25 (26 of them), 2/3 at 0.26 ... 0.5 (25), 0 above.
     assert precisions[0] == pytest.approx((26 + 25 * 2 / 3) / 101)
     assert precisions[1] == 0.0
@@ -249,7 +256,7 @@ def test_coco_precision_equals_pycocotools_called_directly():
         rows = boxes[rng.integers(0, 6, 9)] + noise
         categories = rng.integers(0, 3, 9)
         detections.append(make_detections(rows, rng.uniform(0, 1, 9), categories))
-    ours = coco_average_precision(truths, detections, 3)
+    ours = coco_average_precision(truths, detections, 3).values
 
     def xywh(box):
         return [*box[:2].tolist(), *(box[2:] - box[:2]).tolist()]

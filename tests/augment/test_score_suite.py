@@ -14,6 +14,7 @@ import pytest
 
 from augment.errors import OutputError, ScoreError
 from augment.output.store import open_store
+from augment.scores.nuscenes_metric import NuScenesSplit
 from augment.scores.probe import probe
 from augment.scores.score_suite import ScoreOptions, score_suite
 from augment.scores.suite_facts import read_suite
@@ -239,12 +240,10 @@ def test_nuscenes_results_are_read_and_checked_and_need_the_devkit(suite, tmp_pa
     top = write_nuscenes(tmp_path, suite)
     with pytest.raises(ScoreError, match=r"nuScenes results need the dataset's annotations"):
         score_suite(open_store(suite.path), top)
-    options = ScoreOptions(nuscenes_root=tmp_path / "nowhere")
-    try:
-        import nuscenes  # noqa: F401
-    except ImportError:
-        with pytest.raises(ScoreError, match=r"NDS is computed by nuscenes-devkit"):
-            score_suite(open_store(suite.path), top, options=options)
+    python = tmp_path / "python"
+    options = ScoreOptions(nuscenes=NuScenesSplit(tmp_path, "v1.0-mini", "mini_val", python))
+    with pytest.raises(ScoreError, match=r"python cannot be run to compute NDS"):
+        score_suite(open_store(suite.path), top, options=options)
     path = top / "fog-4" / "results.json"
     edit_json(path, lambda content: content["results"]["t0"][0].update(size=[1.0, float("nan"), 2]))
     with pytest.raises(ScoreError, match=r"not finite: 1 \(sample t0, box 0\)"):
@@ -442,7 +441,9 @@ def test_a_baseline_is_read_from_predictions_and_from_json(suite, good_predictio
     path = tmp_path / "base.json"
     path.write_text(json.dumps(base.model_dump(mode="json")))
     from_json = score_suite(store, good_predictions, path)
-    assert from_json.robustness == scores.robustness
+    assert (from_json.robustness.mce, from_json.robustness.mrra) == (
+        scores.robustness.mce, scores.robustness.mrra,
+    )  # fmt: skip
     for field, value, message in (
         ("suite", "weather-c-v2", r"of another suite: weather-c-v2 there, weather-c-v1 here"),
         ("metric", "mIoU", r"of another metric"),

@@ -42,14 +42,14 @@ CHANGING = recipe_of(
 
 
 def test_times_of_a_scene_are_those_of_its_first_and_last_image() -> None:
-    scene = open_street(STREET)
+    scene = open_street(STREET, has_wet_ground=True)
     times = scene_times(scene)
     stamps = [c.timestamp_ns for f in scene.frames for c in f.cameras.values()]
     assert (times.start_ns, times.end_ns, times.num_frames) == (min(stamps), max(stamps), 4)
 
 
 def test_an_image_has_the_recipe_of_its_own_time() -> None:
-    scene = open_street(STREET)
+    scene = open_street(STREET, has_wet_ground=True)
     times = scene_times(scene)
     middle_ns = (times.start_ns + times.end_ns) // 2
     recipe, plan = plan_at(CHANGING, scene, middle_ns)
@@ -62,16 +62,16 @@ def test_an_image_has_the_recipe_of_its_own_time() -> None:
 
 
 def test_a_frame_alone_has_the_bits_of_the_frame_in_sequence() -> None:
-    scene = open_street(STREET)
+    scene = open_street(STREET, has_wet_ground=True)
     cameras = [next(iter(frame.cameras.values())) for frame in scene.frames]
     sequence = [view.rgb for view in render_views(scene, cameras, CHANGING)]
-    alone = render_view(open_street(STREET), cameras[2], CHANGING).rgb
+    alone = render_view(open_street(STREET, has_wet_ground=True), cameras[2], CHANGING).rgb
     assert np.array_equal(sequence[2], alone)
     assert not np.array_equal(sequence[0], sequence[2])
 
 
 def test_a_changing_image_is_the_image_of_the_plain_recipe_at_its_time() -> None:
-    scene = open_street(STREET)
+    scene = open_street(STREET, has_wet_ground=True)
     camera = next(iter(scene.frames[1].cameras.values()))
     plain = CHANGING.at(scene_times(scene), camera.timestamp_ns)
     assert plain.timelines == ()
@@ -80,7 +80,7 @@ def test_a_changing_image_is_the_image_of_the_plain_recipe_at_its_time() -> None
 
 
 def test_a_constant_timeline_has_the_bits_of_the_plain_number() -> None:
-    scene = open_street(STREET)
+    scene = open_street(STREET, has_wet_ground=True)
     camera = next(iter(scene.frames[1].cameras.values()))
     plain = recipe_of("{smog: {visibility_m: 80}}")
     constant = recipe_of("{smog: {visibility_m: {timeline: [[0, 80], [0.1, 80]]}}}")
@@ -89,7 +89,7 @@ def test_a_constant_timeline_has_the_bits_of_the_plain_number() -> None:
 
 
 def test_a_sweep_has_the_weather_of_its_frames_time() -> None:
-    scene = open_street(STREET)
+    scene = open_street(STREET, has_wet_ground=True)
     for frame in (scene.frames[0], scene.frames[-1]):
         sweep = scene.lidar(frame.index)
         assert sweep is not None
@@ -100,7 +100,7 @@ def test_a_sweep_has_the_weather_of_its_frames_time() -> None:
 
 
 def test_a_live_sample_states_the_weather_of_its_own_time() -> None:
-    scene = open_street(STREET)
+    scene = open_street(STREET, has_wet_ground=True)
     dataset = SceneDataset(scene, CHANGING, load=("image",))
     rates = []
     for frame, index in ((scene.frames[0], 0), (scene.frames[-1], len(dataset) - 1)):

@@ -739,7 +739,7 @@ def test_text_of_yaml_signs(text: str) -> None:
     loads_or_explains(text)
 
 
-@settings(FUZZ, max_examples=400)
+@settings(FUZZ, max_examples=200)
 @given(st.one_of(TOP, SMOG, FLOOD, SNOW))
 def test_known_keys_with_any_values(text: str) -> None:
     loads_or_explains(text)

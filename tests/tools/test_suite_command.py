@@ -6,9 +6,13 @@ from pathlib import Path
 
 import pytest
 
+from augment.output.store import open_store
 from augment.suite.run import run_suite
+from augment.suite.suite_file import read_suite_file
 from tests.augment.suite_runs import make_run
+from tests.tools.test_mirror_outputs import scene_of, write_sequence
 from tools.cli import main
+from tools.mirror import mirror_outputs
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +33,29 @@ def test_verify_says_which_file_has_changed(finished: Path, capsys: pytest.Captu
     assert f"changed: {path.relative_to(finished)}\n" in out and "1 changed, 0 missing" in out
     path.write_bytes(data)
     assert main(["suite", "verify", str(finished)]) == 0
+
+
+def test_a_changed_byte_in_a_copy_of_the_dataset_is_found(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    scene = scene_of(write_sequence(tmp_path / "002"))
+    out = tmp_path / "out"
+    run = make_run(
+        out, scenes=["fake:street"], effects=["fog"], levels=[3], opener=lambda uri: scene
+    )
+    run_suite(run, before_hashes=lambda: mirror_outputs(scene, out, progress=False))
+    suite_file = read_suite_file(open_store(out))
+    copies = [path for path in suite_file.files if path.startswith("source/")]
+    # Two cameras in four frames, of the clean render and of fog. Other files are the dataset's own.
+    assert len(copies) == 16 and "source/fog-3-000/002/camera/left/02.jpg" in copies
+    path = out / "source/fog-3-000/002/camera/left/02.jpg"
+    data = path.read_bytes()
+    path.unlink()  # it may be a link to the rendered image
+    path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    assert main(["suite", "verify", str(out)]) == 1
+    printed = capsys.readouterr().out
+    assert "changed: source/fog-3-000/002/camera/left/02.jpg" in printed
+    assert "1 changed, 0 missing" in printed
 
 
 def test_probe_names_the_files_of_a_variant(finished: Path, capsys: pytest.CaptureFixture) -> None:

@@ -139,6 +139,38 @@ def bench_training(
     return _show(result, json_file, written)
 
 
+def bench_detector(
+    folder: Path | None = None,
+    quick: bool = False,
+    table: Path | None = None,
+    curves: Path | None = None,
+    json_file: JsonFile = None,
+) -> int:
+    """Train a small detector on clean images and on weather; score both on the suite `weather-c`.
+
+    Args:
+        folder: Where images are rendered and predictions are written, and read again by a later
+            run; by default a temporary folder.
+        quick: A few small images, variants and steps.
+        table: Also write the tables to this file, as Markdown.
+        curves: Also draw recall against the level of every effect, as an image.
+        json_file: Also write the figures to this file, with the scores of every seed.
+    """
+    if curves is not None:
+        _subject("trade").check_matplotlib()
+    subject = _subject("detector")
+    result = subject.measure(quick, folder)
+    written = list[Path]()
+    if table is not None:
+        table.write_text(_subject("harness").markdown(result), encoding="utf-8")
+        written.append(table)
+    if curves is not None:
+        titles = {name: arm.title for name, arm in subject.ARMS.items()}
+        _subject("detector_tables").draw_curves(curves, result["facts"]["curves"], titles)
+        written.append(curves)
+    return _show(result, json_file, written)
+
+
 def bench_gpu(
     repeats: int = 30,
     quick: bool = False,
@@ -267,6 +299,7 @@ COMMANDS = {
     "jobs": bench_jobs,
     "dataset": bench_dataset,
     "training": bench_training,
+    "detector": bench_detector,
     "serve": bench_serve,
     "gpu": bench_gpu,
 }

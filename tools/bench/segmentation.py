@@ -74,11 +74,12 @@ class SmallUNet(nn.Module):
     """Scores of classes, [N, C, H, W], of images [N, 3, H, W] in [0, 1].
 
     The first level has half the image's resolution. The scores of four pixels come from one place
-    of it. Channels are normalised within an image, so that no statistics of training images are
-    applied to images in other weather.
+    of it; with an `upscale` of 1 instead of 2 there is one score a place, [N, C, H/2, W/2].
+    Channels are normalised within an image, so that no statistics of training images are applied
+    to images in other weather.
     """
 
-    def __init__(self, num_classes: int, widths: Sequence[int]) -> None:
+    def __init__(self, num_classes: int, widths: Sequence[int], upscale: int = 2) -> None:
         super().__init__()
         pairs = list(itertools.pairwise(widths))
         self.stem = _convolution(3, widths[0], stride=2)
@@ -86,7 +87,8 @@ class SmallUNet(nn.Module):
             nn.Sequential(_convolution(a, b, stride=2), _convolution(b, b)) for a, b in pairs
         )
         self.up = nn.ModuleList(_convolution(a + b, a) for a, b in pairs)
-        self.scores = nn.Conv2d(widths[0], 4 * num_classes, 1)
+        self.scores = nn.Conv2d(widths[0], upscale**2 * num_classes, 1)
+        self.upscale = upscale
 
     def forward(self, images: Tensor) -> Tensor:
         levels = [self.stem(4 * images - 2)]
@@ -97,7 +99,7 @@ class SmallUNet(nn.Module):
             finer = levels.pop()
             coarse = nn.functional.interpolate(features, size=finer.shape[-2:], mode="nearest")
             features = up(torch.cat([coarse, finer], 1))
-        return nn.functional.pixel_shuffle(self.scores(features), 2)
+        return nn.functional.pixel_shuffle(self.scores(features), self.upscale)
 
 
 def _convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:

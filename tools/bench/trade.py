@@ -901,7 +901,7 @@ def check_matplotlib() -> None:
         ClimateGSError: it is not installed.
     """
     if importlib.util.find_spec("matplotlib") is None:
-        raise ClimateGSError("the trade's chart needs matplotlib: pip install 'climategs[plots]'")
+        raise ClimateGSError("the chart needs matplotlib: pip install 'climategs[plots]'")
 
 
 def draw_trade(folder: Path, trade: Trade) -> list[Path]:
