@@ -279,5 +279,5 @@ def _join(
         photo_rgb=join([picture.photo_rgb for picture in pictures]),
         trust=join([picture.trust for picture in pictures]),
         own_car=join([picture.own_car for picture in pictures]),
-        is_inside=join([picture.is_inside for picture in pictures], value=1.0),
+        is_inside=join([picture.is_inside for picture in pictures], value=1),
     )

@@ -186,7 +186,8 @@ def _measure_rate(case: ServeCase) -> Figures:
         tempfile.TemporaryDirectory() as folder,
     ):
         stub = Stub(channel)
-        loop = ClosedLoop(stub, case.scale, recipe.output.image.upper())
+        image_format = "PNG" if recipe.output.image == "png" else "JPEG"
+        loop = ClosedLoop(stub, case.scale, image_format)
         job_recipe = recipe.model_copy(
             update={"render": recipe.render.model_copy(update={"scale": case.scale})}
         )

@@ -147,5 +147,5 @@ def encode_for(request: Any, rgb: np.ndarray, recipe: Recipe) -> bytes:
         if not 1 <= request.image_quality <= 100:
             raise invalid(f"image_quality must be from 1 to 100; got {request.image_quality}")
         quality = round(request.image_quality)
-    changes = {"image": "jpeg", "jpeg_quality": quality}
+    changes = {"image": "jpg", "jpeg_quality": quality}
     return encode_image(rgb, recipe.output.model_copy(update=changes))
