@@ -180,7 +180,8 @@ def _draw_scene(
     is_fading = plan.sun_share < 1 or plan.gloss_fade > 0
     if plan.is_on_photo and (is_fading or any(map(_is_weather, view.effects))):
         with timed("recording car"):
-            own_car = own_car_in_view(scene, camera)
+            lens_camera = None if photo_view is None else photo_view.lens_camera
+            own_car = own_car_in_view(scene, camera, lens_camera)
     with timed("collect parts"):
         actor_ids = view.actor_ids
         if own_car is not None:  # the photo shows the car, and a fit's splats of it lie beside it
@@ -369,7 +370,7 @@ def _render_lens_view(
             ),
         )
         has_trust = recipe.output.trust
-        own_car = own_car_in_view(scene, view_camera) if plan.is_on_photo else None
+        own_car = own_car_in_view(scene, view_camera, lens_camera) if plan.is_on_photo else None
         return ViewPicture(
             rendered.rgb.detach().float().cpu().numpy(),
             start_images(buffers, plan)(),
