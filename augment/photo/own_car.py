@@ -318,11 +318,15 @@ def _car_tops(evidence: np.ndarray, is_unknown: np.ndarray) -> np.ndarray:
 
 # Scale of the images in which the recording car is looked for.
 _SCALE = 0.5
+# Largest entry of a rotation less the identity that is rounding.
+_MIN_TURN = 1e-9
 # Width of the border outside the car in which the weather begins, pixels.
 _BORDER_PX = 2
 
 
-def own_car_mask(scene: Scene, camera: Camera) -> Bool[np.ndarray, "H W"] | None:
+def own_car_mask(
+    scene: Scene, camera: Camera, lens_camera: Camera | None = None
+) -> Bool[np.ndarray, "H W"] | None:
     """Return the pixels of a recorded image that show the recording car.
 
     They are a user's (`Scene.ego_masks`) or, without those, what the images tell. None where the
@@ -332,11 +336,16 @@ def own_car_mask(scene: Scene, camera: Camera) -> Bool[np.ndarray, "H W"] | None
     Args:
         scene: the scene, whose frames have the images.
         camera: a camera of the scene, at any scale, or a window of it.
+        lens_camera: the camera through whose lens the image was recorded, if `camera` is a view of
+            this image, which may be turned.
     """
     scene = scene.as_recorded
     shape = memo_of(scene).get(("own car", camera.name), lambda: _shape_in(scene, camera.name))
     if shape is None:
         return None
+    turn = _turn_of_view(camera, lens_camera)
+    if turn is not None:
+        return _mask_in_turned_view(shape, camera, turn)
     # The place of each pixel's centre in the image of the shape.
     columns = (np.arange(camera.width) + 0.5 - camera.cx) * (
         shape.camera.fx / camera.fx
@@ -353,6 +362,46 @@ def own_car_mask(scene: Scene, camera: Camera) -> Bool[np.ndarray, "H W"] | None
     border = cv2.BORDER_REPLICATE
     share = cv2.remap(shape.mask.astype(np.float32), *places, cv2.INTER_LINEAR, borderMode=border)
     return share >= 0.5
+
+
+def _turn_of_view(camera: Camera, lens_camera: Camera | None) -> np.ndarray | None:
+    """Return the rotation from a view's axes to those of its lens, [3, 3]; None without one."""
+    if lens_camera is None:
+        return None
+    turn = (lens_camera.camera_from_world[:3, :3] @ camera.camera_from_world[:3, :3].T).numpy()
+    return None if np.abs(turn - np.eye(3)).max() < _MIN_TURN else turn
+
+
+def _mask_in_turned_view(
+    shape: _CarShape, camera: Camera, turn: np.ndarray
+) -> Bool[np.ndarray, "H W"]:
+    """Return the pixels of a turned view that show the recording car.
+
+    Args:
+        shape: the car in images.
+        camera: the view.
+        turn: rotation from the view's axes to those of the images, [3, 3].
+    """
+    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    x = (columns - camera.cx) / camera.fx
+    y = (rows - camera.cy) / camera.fy
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ turn.T
+    is_ahead = rays[..., 2] > 0
+    z = np.where(is_ahead, rays[..., 2], 1.0)
+    u = shape.camera.fx * rays[..., 0] / z + shape.camera.cx
+    v = shape.camera.fy * rays[..., 1] / z + shape.camera.cy
+    if shape.mask is None:
+        assert shape.tops is not None
+        tops = np.interp(u, np.arange(len(shape.tops)) + 0.5, shape.tops)
+        return is_ahead & (v >= tops)
+    far = 4.0 * max(shape.camera.width, shape.camera.height)
+    places = (
+        (u.clip(-far, far) - 0.5).astype(np.float32),
+        (v.clip(-far, far) - 0.5).astype(np.float32),
+    )
+    border = cv2.BORDER_REPLICATE
+    share = cv2.remap(shape.mask.astype(np.float32), *places, cv2.INTER_LINEAR, borderMode=border)
+    return is_ahead & (share >= 0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -392,7 +441,9 @@ class OwnCar:
         return area > 0
 
 
-def own_car_in_view(scene: Scene, camera: Camera) -> OwnCar | None:
+def own_car_in_view(
+    scene: Scene, camera: Camera, lens_camera: Camera | None = None
+) -> OwnCar | None:
     """Return the recording car in a view of recorded images; None where they show none.
 
     The result is computed once for all images of a camera.
@@ -400,10 +451,12 @@ def own_car_in_view(scene: Scene, camera: Camera) -> OwnCar | None:
     Args:
         scene: the scene, whose frames have the images.
         camera: a camera of the scene, at any scale, or a window of it.
+        lens_camera: see `own_car_mask`.
     """
+    turn = _turn_of_view(camera, lens_camera)
 
     def make() -> tuple[OwnCar | None]:  # a value that is None would be made again
-        mask = own_car_mask(scene, camera)
+        mask = own_car_mask(scene, camera, lens_camera)
         if mask is None or not mask.any():
             return (None,)
         distance_px = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3)
@@ -414,7 +467,8 @@ def own_car_in_view(scene: Scene, camera: Camera) -> OwnCar | None:
 
     lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
     scene = scene.as_recorded
-    return memo_of(scene).get(("own car in view", camera.name, *lens), make)[0]
+    key = ("own car in view", camera.name, *lens)
+    return memo_of(scene).get(key if turn is None else (*key, turn.tobytes()), make)[0]
 
 
 def _shape_in(scene: Scene, name: str) -> _CarShape | None:

@@ -8,9 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from augment.errors import SceneError
 from augment.photo.lens_photo import transfer_change
+from augment.photo.own_car import own_car_mask
 from augment.scene.cameras import Camera
 from augment.scene.lenses import OpenCVLens
 from augment.scene.scene import Scene
@@ -144,3 +146,29 @@ def test_pictures_do_not_depend_on_the_order_of_views(street, tmp_path):
     first = render_view(scene, camera, recipe(visibility_m=60.0)).rgb
     again = render_view(photographed(street, tmp_path), camera, recipe(visibility_m=60.0)).rgb
     np.testing.assert_array_equal(first, again)
+
+
+def test_the_recording_car_is_where_a_turned_view_looks_at_it(street, tmp_path):
+    """A mask of the lowest rows, in a view that looks 25 degrees down."""
+    frame = street.frames[1]
+    name = next(iter(frame.cameras))
+    pinhole = frame.cameras[name].resized(WIDTH, HEIGHT)
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[HEIGHT - 30 :] = True
+    frames = (dataclasses.replace(frame, cameras={name: pinhole}),)
+    scene = dataclasses.replace(street, frames=frames, ego_masks={name: mask})
+    angle = np.radians(-25.0)
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[1:3, 1:3] = torch.tensor([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    view = dataclasses.replace(pinhole, camera_from_world=turn @ pinhole.camera_from_world)
+    lens_camera = dataclasses.replace(pinhole, lens=LENS)
+    in_view = own_car_mask(scene, view, lens_camera)
+    directions = view.ray_directions().numpy().astype(float)
+    local = directions @ pinhole.camera_from_world[:3, :3].numpy().T
+    row = pinhole.fy * local[..., 1] / local[..., 2] + pinhole.cy
+    expected = (local[..., 2] > 0) & (row > HEIGHT - 30)
+    is_clear = np.abs(row - (HEIGHT - 30)) > 1
+    assert in_view is not None and expected[is_clear].any() and not expected[is_clear].all()
+    np.testing.assert_array_equal(in_view[is_clear], expected[is_clear])
+    same = own_car_mask(scene, pinhole, lens_camera)
+    np.testing.assert_array_equal(same, mask)
