@@ -204,9 +204,10 @@ class Render(Section):
     own_car: Literal["dry", "snowy"] = "dry"
     """Of base recorded: dry keeps all weather off the pixels that show the recording car; snowy
     lets snow that lies on the scene lie on it, too."""
-    shutter_strips: Whole = Field(default=16, ge=1, le=4096)
+    shutter_strips: Whole = Field(default=4, ge=1, le=4096)
     """Strips of rows in which an image of a rolling shutter is drawn, each at the pose and time of
-    its middle; cameras without one are drawn at once."""
+    its middle; then rows move to their own poses by depth. Cameras without one are drawn at
+    once."""
     speed: Speed = Speed()
 
     @property

@@ -41,6 +41,8 @@ MARGIN_PX = 4
 VIEW_COST_PX = 150_000
 # Columns and rows of views that are tried, spread over the lens image.
 _GRIDS = ((2, 1), (1, 2), (3, 1), (2, 2), (3, 2), (2, 3), (3, 3), (4, 3), (3, 4), (4, 4), (5, 5))
+# Smallest factor of the splats' blur in a view: a window of an image may show less finely.
+MIN_BLUR_GAIN = 0.1
 # Largest factor of the splats' blur in a view.
 MAX_BLUR_GAIN = 4.0
 # Spacing of the pixels whose rays are solved, where rays in between can be interpolated, pixels.
@@ -48,7 +50,7 @@ _COARSE_PX = 8
 # Largest error of interpolated rays, pixels.
 _MAX_RAY_ERROR_PX = 1e-3
 # Layouts that are remembered.
-_NUM_LAYOUTS = 16
+_NUM_LAYOUTS = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,24 +114,43 @@ class LensLayout:
         return np.argmax([view.weights for view in self.views], axis=0)
 
 
-def layout_of(camera: Camera) -> LensLayout:
+def layout_of(camera: Camera, whole: Camera | None = None) -> LensLayout:
     """Return the pinhole views that cover the picture of a camera with a lens.
 
     Args:
         camera: the camera; its pose and shutter do not matter.
+        whole: the camera of whose image `camera` is a window. The window is looked up in views with
+            the directions and resolutions of the whole image's, so that both look alike.
 
     Raises:
         ValueError: no pixel of the camera sees anything.
     """
+    views = () if whole is None else layout_of(whole).views
     assert camera.lens is not None
-    return _make_layout(camera.lens, camera.intrinsics, camera.width, camera.height, camera.name)
+    return _make_layout(
+        camera.lens, camera.intrinsics, camera.width, camera.height, camera.name, views
+    )
 
 
 @functools.lru_cache(maxsize=_NUM_LAYOUTS)
 def _make_layout(
-    lens: Lens, intrinsics: Intrinsics, width: int, height: int, name: str
+    lens: Lens,
+    intrinsics: Intrinsics,
+    width: int,
+    height: int,
+    name: str,
+    whole_views: tuple[PinholeView, ...],
 ) -> LensLayout:
-    """Return the layout of `layout_of`."""
+    """Return the layout of `layout_of`.
+
+    Args:
+        lens: the lens.
+        intrinsics: numbers of the image.
+        width: width of the image, pixels.
+        height: height of the image, pixels.
+        name: name of the camera.
+        whole_views: views of the image of which this one is a window; empty for a whole image.
+    """
     rays, is_inside = pixel_rays(lens, intrinsics, width, height)
     if not is_inside.any():
         raise ValueError(
@@ -137,9 +158,26 @@ def _make_layout(
             f"{type(lens).__name__} (up to {math.degrees(lens.max_angle_rad):.4g} degrees from the "
             f"axis); check the lens's numbers and {intrinsics}"
         )
-    rotations = _choose_views(rays, is_inside, intrinsics)
-    views = _views_of(rotations, rays, is_inside, intrinsics)
-    return LensLayout(views, is_inside, rays.astype(np.float32))
+    if whole_views:
+        rotations = [view.view_from_camera for view in whole_views]
+    else:
+        rotations = _choose_views(rays, is_inside, intrinsics)
+    weights = _weights(rotations, rays, is_inside)
+    # A window that reaches beyond the whole image may see what no view shows.
+    is_inside = is_inside & (weights.sum(0) > 0)
+    views = [
+        _view_of(
+            rotation,
+            rays,
+            weight,
+            intrinsics,
+            is_single=len(rotations) == 1,
+            whole_view=whole_views[number] if whole_views else None,
+        )
+        for number, (rotation, weight) in enumerate(zip(rotations, weights, strict=True))
+        if (weight > 0).any()
+    ]
+    return LensLayout(tuple(views), is_inside, rays.astype(np.float32))
 
 
 def pixel_rays(
@@ -299,28 +337,6 @@ def _weights(
     return weights / np.maximum(weights.sum(0), 1e-12)
 
 
-def _views_of(
-    rotations: Sequence[Float64[np.ndarray, "3 3"]],
-    rays: Float64[np.ndarray, "H W 3"],
-    is_inside: Bool[np.ndarray, "H W"],
-    intrinsics: Intrinsics,
-) -> tuple[PinholeView, ...]:
-    """Return the views with these rotations, as small as the rays allow.
-
-    Args:
-        rotations: from the camera's axes to the views'.
-        rays: unit directions of the pixels in the camera's axes.
-        is_inside: pixels that see something.
-        intrinsics: of the lens image.
-    """
-    weights = _weights(rotations, rays, is_inside)
-    return tuple(
-        _view_of(rotation, rays, weight, intrinsics, is_single=len(rotations) == 1)
-        for rotation, weight in zip(rotations, weights, strict=True)
-        if (weight > 0).any()
-    )
-
-
 def _flat_places(
     rotation: Float64[np.ndarray, "3 3"],
     rays: Float64[np.ndarray, "H W 3"],
@@ -348,6 +364,7 @@ def _view_of(
     intrinsics: Intrinsics,
     *,
     is_single: bool,
+    whole_view: PinholeView | None = None,
 ) -> PinholeView:
     """Return one view, as small as the pixels that are looked up in it allow.
 
@@ -357,16 +374,21 @@ def _view_of(
         weight: share of the view in each pixel.
         intrinsics: of the lens image.
         is_single: True for the only view of a layout.
+        whole_view: view of the whole image whose resolution is taken; None to choose it.
     """
     is_used = weight > 0
     across, down = _flat_places(rotation, rays, is_used, intrinsics)
-    smallest, areas = _stretches(across, down, is_used)
-    scale = 1 / smallest
-    if abs(scale - 1) < 0.02:
-        scale = 1.0
-    blur_gain = scale * scale
-    if not is_single and len(areas):
-        blur_gain *= float(np.median(areas))
+    if whole_view is None:
+        smallest, areas = _stretches(across, down, is_used)
+        scale = 1 / smallest
+        if abs(scale - 1) < 0.02:
+            scale = 1.0
+        blur_gain = scale * scale
+        if not is_single and len(areas):
+            blur_gain *= float(np.median(areas))
+    else:
+        scale = whole_view.intrinsics.fx / intrinsics.fx
+        blur_gain = whole_view.blur_gain
     # The view's pixels have the raster of the lens image at the axis: without distortion, no pixel
     # lies between others.
     columns = across * scale + intrinsics.cx
@@ -385,7 +407,7 @@ def _view_of(
         np.stack([columns - left, rows - top], -1).astype(np.float32),
         weight.astype(np.float32),
         np.where(is_used, 1 / np.where(is_used, rays @ rotation[2], 1.0), 0.0).astype(np.float32),
-        min(max(blur_gain, 1.0), MAX_BLUR_GAIN),
+        min(max(blur_gain, MIN_BLUR_GAIN), MAX_BLUR_GAIN),
     )
 
 

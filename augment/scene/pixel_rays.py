@@ -146,8 +146,21 @@ def _project(
         world_from_camera: the pose.
     """
     local = (points_m - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
+    pixels = project_local(camera, local)
+    return pixels, ~np.isnan(pixels[:, 0])
+
+
+def project_local(
+    camera: Camera, local_m: Float64[np.ndarray, "N 3"]
+) -> Float64[np.ndarray, "N 2"]:
+    """Return the pixels of points in the camera's axes, NaN where they cannot be shown.
+
+    Args:
+        camera: any camera but an orthographic one; a shutter does not count.
+        local_m: the points, metres.
+    """
     if camera.lens is not None:
-        return camera.lens.project(local, camera.intrinsics)
-    is_ahead = local[:, 2] >= MIN_DEPTH_M
-    z = np.where(is_ahead, local[:, 2], np.nan)[:, None]
-    return local[:, :2] / z * (camera.fx, camera.fy) + (camera.cx, camera.cy), is_ahead
+        return camera.lens.project(local_m, camera.intrinsics)[0]
+    is_ahead = local_m[:, 2] >= MIN_DEPTH_M
+    z = np.where(is_ahead, local_m[:, 2], np.nan)[:, None]
+    return local_m[:, :2] / z * (camera.fx, camera.fy) + (camera.cx, camera.cy)

@@ -36,7 +36,7 @@ from augment.photo.photo_objects import copy_size
 from augment.photo.recorded_base import PhotoView, mix, open_photo, splat_classes
 from augment.photo.trust import trust_mask
 from augment.render.backends import choose_backend, renders_on_gpu
-from augment.render.buffers import AUTO, CPU, EXPECTED_DEPTH, SPLAT_IDS, RenderOutput
+from augment.render.buffers import ALPHA, AUTO, CPU, EXPECTED_DEPTH, SPLAT_IDS, RenderOutput
 from augment.render.composite import apply_color_map, to_bytes
 from augment.render.constants import SURFACE_ALPHA
 from augment.render.rasterize import rasterize
@@ -330,6 +330,10 @@ def _render_lens_view(
         with timed("photo"):
             lens_photo = open_lens_photo(scene, camera)
 
+    moves_rows = camera.shutter is not None and lens_photo is None
+    if moves_rows:
+        plan = replace(plan, image_buffers=plan.image_buffers | {ALPHA, EXPECTED_DEPTH})
+
     def draw(view_camera: Camera, blur_gain: float, lens_camera: Camera) -> ViewPicture:
         photo_view = None
         photo_rgb = None
@@ -372,10 +376,12 @@ def _render_lens_view(
             start_images(buffers, plan)(),
             trust=trust_mask(scene, view_camera, backend=backend) if has_trust else None,
             own_car=None if own_car is None else own_car.mask,
+            motion_depth_m=_motion_depth(raster) if moves_rows else None,
             photo_rgb=photo_rgb,
         )
 
-    picture = draw_through_lens(camera, recipe.render.shutter_strips, draw)
+    num_strips = recipe.render.shutter_strips
+    picture = draw_through_lens(camera, num_strips, draw, moves_rows=moves_rows)
     names = {effect.hooks.name for drawing in drawings for effect in drawing.view.effects}
     first = drawings[0]
     effects_in_view = tuple(
@@ -423,6 +429,13 @@ def _render_lens_view(
         trust = {name: np.where(own_car, np.uint8(0), mask) for name, mask in trust.items()}
     active = {effect.hooks.name: effect for effect in plan.active_effects(scene, backend=backend)}
     return _weathered(images, camera, plan, recipe, active, trust, car)
+
+
+def _motion_depth(raster: RenderOutput) -> np.ndarray:
+    """Return z of the surfaces by which rows of a rolling shutter are moved, 0 = none."""
+    assert raster.alpha is not None and raster.expected_depth is not None
+    is_surface = raster.alpha.detach() >= SURFACE_ALPHA
+    return torch.where(is_surface, raster.expected_depth.detach(), 0.0).float().cpu().numpy()
 
 
 def is_on_glass(effect: EffectInScene) -> bool:
