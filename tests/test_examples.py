@@ -47,7 +47,7 @@ def predicts_the_road(picture: np.ndarray) -> bool:
 
 
 def finds_the_cars(picture: np.ndarray) -> bool:
-    """Image, true heat map, learnt heat map: 165 of 255 in middles of cars, 8 off cars."""
+    """Image, true heat map, learnt heat map: 129 of 255 in middles of cars, 1 off cars."""
     _, truth, prediction = np.split(picture[..., 0], 3, axis=1)
     return prediction[truth > 127].mean() > 60 + prediction[truth == 0].mean()
 

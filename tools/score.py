@@ -114,7 +114,8 @@ def score_lines(scores: SuiteScores) -> list[str]:
     means = scores.robustness
     lines.append(
         f"  mPC {means.mpc:.4f}  rPC {means.rpc:.3f}  mRR {means.mrr:.3f}  mRA {means.mra:.3f}"
-        + ("" if means.mce is None else f"  mCE {means.mce:.3f}  mRRA {means.mrra:+.3f}")
+        + ("" if means.mce is None else f"  mCE {means.mce:.3f}")
+        + ("" if means.mrra is None else f"  mRRA {means.mrra:+.3f}")
     )
     if means.mpc_interval is not None:
         intervals = {

@@ -1,10 +1,10 @@
 """A recording from a COLMAP reconstruction of a video.
 
 `record_colmap` writes images, undistorted or with their lens, poses in metres with z up, and depth
-between the reconstructed points. COLMAP knows neither metres nor up. Both come from the road: the plane under
-the cameras on which most of the low points lie is taken as level; a camera's height above it, or
-GPS, gives the length of a unit. Without moving boxes everything that moves by itself is part of the
-street.
+between the reconstructed points. COLMAP knows neither metres nor up. Both come from the road: the
+plane under the cameras on which most of the low points lie is taken as level; a camera's height
+above it, or GPS, gives the length of a unit. Without moving boxes everything that moves by itself
+is part of the street.
 """
 
 from __future__ import annotations

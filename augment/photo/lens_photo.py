@@ -53,8 +53,10 @@ class LensPhoto:
             rows = slice(top, top + lens_camera.height)
             return np.ascontiguousarray(self.pixels[rows, left : left + lens_camera.width])
         # The whole image, seen from where the strip was recorded.
-        whole = replace(self.camera, camera_from_world=lens_camera.camera_from_world, shutter=None)
-        return undistort(self.pixels, whole, view)
+        whole_camera = replace(
+            self.camera, camera_from_world=lens_camera.camera_from_world, shutter=None
+        )
+        return undistort(self.pixels, whole_camera, view)
 
 
 def open_lens_photo(scene: Scene, camera: Camera) -> LensPhoto:

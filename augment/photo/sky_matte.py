@@ -79,6 +79,8 @@ _THIN_LUMA_SHARE = 0.25
 _SKY_WINDOWS_PX = (2, 8, 32)
 # Least share of a view that the undistorted copy of its image shows for the copy's sky to count.
 _MIN_COPY_SHARE = 0.7
+# Samples of an image along a side, of which the share is measured.
+_SHARE_SAMPLES = 32
 # Difference of a view from a recorded one that is rounding of its size, pixels.
 _MAX_VIEW_OFFSET_PX = 2.0
 # Weight of each window over the one before.
@@ -257,12 +259,15 @@ def _kinds_of_copy(
     """Return the kinds of pixels that the undistorted copy of an image tells of a view.
 
     Beyond the copy the nearest pixel counts. None where there is no copy, where it is too dark, or
-    where the view lies beside it.
+    where it shows too little of the image. This is the same for all views of an image, so that the
+    sky does not change from strip to strip.
     """
     of_frame = (f for f in scene.seen_frames or () if f.index == frame.index)
     copy_frame = next(of_frame, None)
     copy = None if copy_frame is None else copy_frame.cameras.get(view.name)
     if copy_frame is None or copy is None or not copy.is_pinhole:
+        return None
+    if _share_in_copy(frame.cameras[view.name], copy) < _MIN_COPY_SHARE:
         return None
     kinds = recorded_sky_regions(scene, copy_frame, view.name)
     if kinds is None:
@@ -277,12 +282,30 @@ def _kinds_of_copy(
     z = np.maximum(rays[..., 2], 1e-6)
     u = np.floor(small.fx * rays[..., 0] / z + small.cx)
     v = np.floor(small.fy * rays[..., 1] / z + small.cy)
-    is_inside = (rays[..., 2] > 0) & (u >= 0) & (u < small.width) & (v >= 0) & (v < small.height)
-    if is_inside.mean() < _MIN_COPY_SHARE:
-        return None
     last_row = small.height - 1
     last_column = small.width - 1
     return kinds[v.clip(0, last_row).astype(int), u.clip(0, last_column).astype(int)]
+
+
+def _share_in_copy(lens_camera: Camera, copy: Camera) -> float:
+    """Return the share of an image's pixels, sampled, that its undistorted copy shows.
+
+    Args:
+        lens_camera: the camera with its lens.
+        copy: the pinhole camera of the copy.
+    """
+    if lens_camera.lens is None:
+        return 1.0
+    columns = (np.arange(_SHARE_SAMPLES) + 0.5) * lens_camera.width / _SHARE_SAMPLES
+    rows = (np.arange(_SHARE_SAMPLES) + 0.5) * lens_camera.height / _SHARE_SAMPLES
+    pixels = np.stack(np.meshgrid(columns, rows), -1)
+    rays, is_seen = lens_camera.lens.rays(pixels, lens_camera.intrinsics)
+    is_seen &= rays[..., 2] > 0
+    z = np.where(is_seen, rays[..., 2], 1.0)
+    u = copy.fx * rays[..., 0] / z + copy.cx
+    v = copy.fy * rays[..., 1] / z + copy.cy
+    is_shown = is_seen & (u >= 0) & (u < copy.width) & (v >= 0) & (v < copy.height)
+    return float(is_shown.mean())
 
 
 def _kinds_in_view(

@@ -135,8 +135,8 @@ def count_pixels_through_lens(
     frames: BoxFrames,
     windows: Int64[np.ndarray, "B 4"],
     depth_m: Float32[np.ndarray, "H W"],
-    instance: UInt16[np.ndarray, "h w"],
-    scenery: Bool[np.ndarray, "h w"],
+    instance: UInt16[np.ndarray, "_ _"],
+    scenery: Bool[np.ndarray, "_ _"],
     actors: Int64[np.ndarray, " B"],
     near_m: float,
 ) -> PixelCounts:

@@ -615,12 +615,20 @@ class Scene:
 
         All that does not depend on the places of actors is computed for this scene, so that it is
         computed once for any number of moves. A scene whose background or sky was replaced after
-        the move is taken as it is.
+        the move is taken as it is; one whose frames were replaced has these frames here, too.
         """
         base = self.recorded
         if base is None or base.background is not self.background or base.sky is not self.sky:
             return self
-        return base
+        is_same = base.frames is self.frames and base.seen_frames is self.seen_frames
+        return base if is_same else self._recorded_in_frames
+
+    @cached_property
+    def _recorded_in_frames(self) -> Scene:
+        """Return the scene as it was recorded, with the frames of this one."""
+        assert self.recorded is not None
+        base = self.recorded
+        return replace(self, actors=base.actors, labels=base.labels, recorded=None)
 
     def without_memo(self) -> Scene:
         """Return the same scene as an object of its own, of which nothing has been computed yet."""

@@ -7,6 +7,7 @@ intervals of differences and quotients are those of pairs.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,8 +68,15 @@ class ResampledValues:
             pairs = [(row, baseline.effects[name]) for name, row in self.effects.items()]
             errors = [row.corruption_error(base_row) for row, base_row in pairs]
             gains = [row.relative_gain(base_row) for row, base_row in pairs]
-            means |= {"mce": np.mean(errors, axis=0), "mrra": np.mean(gains, axis=0)}
+            means |= {"mce": _mean_of_finite(errors), "mrra": _mean_of_finite(gains)}
         return means
+
+
+def _mean_of_finite(rows: Sequence[Resamples]) -> Resamples:
+    """Return the mean over the rows that have a value, in each resample; NaN where none has."""
+    values = np.array(rows)
+    has_value = np.isfinite(values)
+    return np.where(has_value, values, 0).sum(axis=0) / has_value.sum(axis=0)
 
 
 def find_interval(values: Resamples) -> Interval | None:

@@ -29,17 +29,18 @@ class EffectValues:
         """Return RR: the sum over the levels, over the number of levels times the clean value."""
         return sum(self.levels) / (len(self.levels) * self.clean)
 
-    def corruption_error(self, baseline: EffectValues) -> float:
-        """Return CE: the sum of 1 - M over that of a baseline."""
+    def corruption_error(self, baseline: EffectValues) -> float | None:
+        """Return CE: the sum of 1 - M over that of a baseline; None where that makes no error."""
         baseline_error = sum(1 - value for value in baseline.levels)
         if baseline_error == 0:
-            raise ScoreError("the baseline makes no error at any level; CE has no meaning")
+            return None
         return sum(1 - value for value in self.levels) / baseline_error
 
-    def relative_gain(self, baseline: EffectValues) -> float:
-        """Return RRA: the sum over the levels over that of a baseline, less 1."""
+    def relative_gain(self, baseline: EffectValues) -> float | None:
+        """Return RRA: the sum over the levels over that of a baseline, less 1; None where the
+        baseline scores 0 at every level."""
         if sum(baseline.levels) == 0:
-            raise ScoreError("the baseline scores 0 at every level; RRA has no meaning")
+            return None
         return sum(self.levels) / sum(baseline.levels) - 1
 
 
@@ -56,9 +57,9 @@ class Robustness:
     mean_ability: float
     """mRA: mean over effects and levels of M over the clean value."""
     mean_corruption_error: float | None
-    """mCE: mean over effects of CE; None without a baseline."""
+    """mCE: mean of CE over the effects that have one; None without a baseline."""
     mean_relative_gain: float | None
-    """mRRA: mean over effects of RRA; None without a baseline."""
+    """mRRA: mean of RRA over the effects that have one; None without a baseline."""
 
 
 def summarize(
@@ -92,8 +93,9 @@ def summarize(
     abilities = [value / row.clean for row in rows for value in row.levels]
     errors = gains = None
     if baseline is not None:
-        errors = _mean([row.corruption_error(baseline[name]) for name, row in effects.items()])
-        gains = _mean([row.relative_gain(baseline[name]) for name, row in effects.items()])
+        pairs = [(row, baseline[name]) for name, row in effects.items()]
+        errors = _mean_of_known([row.corruption_error(base_row) for row, base_row in pairs])
+        gains = _mean_of_known([row.relative_gain(base_row) for row, base_row in pairs])
     return Robustness(
         mean_performance=_mean(level_means),
         relative_performance=_mean(level_means) / _mean([row.clean for row in rows]),
@@ -107,3 +109,9 @@ def summarize(
 def _mean(values: Sequence[float]) -> float:
     """Return the mean of numbers."""
     return float(np.mean(values))
+
+
+def _mean_of_known(values: Sequence[float | None]) -> float | None:
+    """Return the mean of the numbers that are known; None if none is."""
+    known_values = [value for value in values if value is not None]
+    return _mean(known_values) if known_values else None

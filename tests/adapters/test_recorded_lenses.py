@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -11,13 +12,19 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
+from adapters.base import open_scene
 from adapters.camera_files.camera_files import read_views
 from adapters.camera_files.lenses import colmap_lens, nerfstudio_lens
 from adapters.camera_files.paths import with_camera_path
+from adapters.ego_masks import with_ego_masks
 from adapters.kitti.adapter import open_kitti
-from adapters.raw_drive import RawDrive
+from adapters.pandaset.adapter import read_pandaset
+from adapters.raw_drive import DriveOptions, RawDrive
+from adapters.recorded_lenses import undistorted_scene, with_lenses_of
 from adapters.recording.files import read_calibration
+from adapters.street_gaussians.adapter import open_raw
 from adapters.waymo.adapter import WaymoOptions, read_waymo
+from augment.dataset import SceneDataset, boxes_2d
 from augment.errors import AdapterError
 from augment.files.lens_records import lens_record, shutter_record
 from augment.files.recorded_images import decode_image, has_image
@@ -28,7 +35,11 @@ from augment.scene.lenses import FisheyeLens, FThetaLens, Intrinsics, OpenCVLens
 from augment.scene.scene import Gaussians, Scene
 from augment.scene.shutter import RollingShutter
 from augment.scene.sky import ConstantSky
+from recipes.schema import Recipe
+from tests.adapters import drivestudio_files as drivestudio
 from tests.adapters import kitti_files as kitti
+from tests.adapters import pandaset_files as pandaset
+from tests.adapters import street_gaussians_files as street_gaussians
 from tests.adapters import waymo_files as waymo
 
 QUERY = {"voxel_m": "0.2", "image_scale": "1", "sky_size": "32"}
@@ -416,3 +427,124 @@ def kitti_like_scene(frames: tuple[Frame, ...]) -> Scene:
     )
     sky = ConstantSky(torch.zeros(3))
     return Scene("a", "kitti:a", one, (), sky, frames)
+
+
+# ---- Processed data of other projects ------------------------------------------------------------
+
+
+def test_a_drivestudio_run_keeps_lenses_that_its_training_took_out(tmp_path: Path):
+    numbers = drivestudio.write_as_drivestudio(tmp_path / "kept")
+    scene = open_scene(f"drivestudio:{numbers.folder}?lens=recorded&frames=3:5")
+    plain = open_scene(f"drivestudio:{numbers.folder}?frames=3:5")
+    lens = OpenCVLens.from_coefficients([float(k) for k in drivestudio.DISTORTION])
+    assert scene.seen_frames is not None
+    for frame, pinholes, expected in zip(
+        scene.frames, scene.seen_frames, plain.frames, strict=True
+    ):
+        for name, camera in frame.cameras.items():
+            assert camera.lens == lens
+            assert camera.intrinsics == expected.cameras[name].intrinsics
+            assert camera.camera_from_world.equal(expected.cameras[name].camera_from_world)
+            assert pinholes.cameras[name].is_pinhole
+        assert frame.image_paths == expected.image_paths
+    assert scene.background.means.equal(plain.background.means)
+
+
+def test_a_drivestudio_run_on_distorted_images_has_no_lens_and_says_so(tmp_path: Path):
+    changes = {"data.pixel_source.undistort": False}
+    numbers = drivestudio.write_as_drivestudio(tmp_path / "distorted", config=changes)
+    scene = open_scene(f"drivestudio:{numbers.folder}?lens=recorded&frames=3:4")
+    assert scene.seen_frames is None
+    assert all(camera.is_pinhole for camera in scene.frames[0].cameras.values())
+    assert [p for p in scene.problems if "lens=recorded changes nothing" in p]
+
+
+def test_a_street_gaussians_dataset_keeps_its_lenses(tmp_path: Path):
+    street_gaussians.write_as_street_gaussians(tmp_path / "data", frames=2, cameras=1)
+    scene = open_raw(tmp_path / "data", QUERY | {"lens": "recorded"})
+    (camera,) = scene.frames[0].cameras.values()
+    assert camera.lens == OpenCVLens.from_coefficients([0.04, -0.34, 0.001, -0.0003, 0.0])
+    assert Path(scene.frames[0].image_paths[camera.name]).parent == tmp_path / "data/images"
+    assert scene.seen_frames is not None
+    assert scene.seen_frames[0].cameras[camera.name].is_pinhole
+
+
+def test_published_images_without_lenses_change_nothing_and_say_so(tmp_path: Path):
+    root = pandaset.write_as_pandaset(tmp_path / "001")
+    query = {"lens": "recorded"}
+    drive = read_pandaset(str(root), query, DriveOptions.from_query("pandaset", query))
+    assert drive.recorded_frames is None
+    assert [p for p in drive.problems if "PandaSet's images show no lens distortion" in p]
+    with pytest.raises(AdapterError, match="lens must be one of undistorted, recorded; got 'raw'"):
+        DriveOptions.from_query("pandaset", {"lens": "raw"})
+
+
+# ---- The recording car, fits, samples ------------------------------------------------------------
+
+
+def test_masks_of_the_recording_car_are_of_the_images_as_recorded(
+    kitti_scene: Scene, tmp_path: Path
+):
+    """A mask of what lies straight below the lens's middle is that of the copies' pixels there."""
+    width, height = kitti.LENS_SIZE
+    mask = np.zeros((height, width), np.uint8)
+    mask[height - 20 :] = 255
+    assert cv2.imwrite(str(tmp_path / "image_02.png"), mask)
+    scene = with_ego_masks(kitti_scene, tmp_path)
+    assert scene.ego_masks is not None and scene.seen_frames is not None
+    copy = scene.seen_frames[0].cameras["image_02"]
+    lens_camera = scene.frames[0].cameras["image_02"]
+    rows, columns = np.mgrid[: copy.height, : copy.width] + 0.5
+    rays = np.stack(
+        [(columns - copy.cx) / copy.fx, (rows - copy.cy) / copy.fy, np.ones_like(rows)], -1
+    )
+    assert lens_camera.lens is not None
+    pixels, _ = lens_camera.lens.project(rays, lens_camera.intrinsics)
+    expected = pixels[..., 1] > height - 20
+    is_at_border = np.abs(pixels[..., 1] - (height - 20)) < 1
+    stated = scene.ego_masks["image_02"]
+    np.testing.assert_array_equal(stated[~is_at_border], expected[~is_at_border])
+
+
+def test_a_fit_learns_from_copies_and_keeps_lenses_at_its_poses(kitti_scene: Scene):
+    start = undistorted_scene(kitti_scene)
+    assert start.seen_frames is None
+    assert all(c.is_pinhole for f in start.frames for c in f.cameras.values())
+
+    def moved(frame: Frame) -> Frame:
+        cameras = {}
+        for name, camera in frame.cameras.items():
+            pose = camera.camera_from_world.clone()
+            pose[0, 3] += 0.01
+            cameras[name] = dataclasses.replace(camera, camera_from_world=pose)
+        return dataclasses.replace(frame, cameras=cameras)
+
+    fitted = dataclasses.replace(start, frames=tuple(map(moved, start.frames)))
+    scene = with_lenses_of(fitted, kitti_scene.frames)
+    assert scene.seen_frames == fitted.frames
+    for frame, recorded, corrected in zip(
+        scene.frames, kitti_scene.frames, fitted.frames, strict=True
+    ):
+        camera = frame.cameras["image_02"]
+        assert camera.lens == recorded.cameras["image_02"].lens
+        assert frame.image_paths == recorded.image_paths
+        pose = corrected.cameras["image_02"].camera_from_world
+        assert camera.camera_from_world.equal(pose)
+
+
+def test_samples_of_cameras_with_lenses_refuse_projections_of_pinholes(kitti_scene: Scene):
+    recipe = Recipe(name="clear")
+    (sample, *_) = SceneDataset(kitti_scene, recipe)
+    camera = sample["camera"]
+    assert camera["lens"] == lens_record(kitti_scene.frames[0].cameras["image_02"].lens)
+    assert camera["shutter"] is None
+    boxes = {
+        "centers_m": torch.zeros(1, 3),
+        "quats": torch.tensor([[1.0, 0, 0, 0]]),
+        "sizes_m": torch.ones(1, 3),
+        "labels": ["Car"],
+        "track_ids": ["a"],
+        "frame": "world",
+    }
+    with pytest.raises(ValueError, match="has a lens or a rolling shutter"):
+        boxes_2d({**sample, "boxes": boxes})

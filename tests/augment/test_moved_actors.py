@@ -1,4 +1,5 @@
 import dataclasses
+import pickle
 
 import numpy as np
 import pytest
@@ -248,3 +249,23 @@ def test_moves_that_cannot_be_are_refused_in_words() -> None:
     for words, call in refusals.items():
         with pytest.raises(SceneError, match=words):
             call()
+
+
+def test_a_moved_scene_with_other_frames_is_recorded_in_these_frames() -> None:
+    scene, _ = moved_street()
+    fewer = dataclasses.replace(scene, frames=scene.frames[:2])
+    recorded = fewer.as_recorded
+    assert recorded.frames is fewer.frames
+    assert recorded.actors is scene.as_recorded.actors
+    assert recorded is fewer.as_recorded
+    assert scene.as_recorded is scene.recorded
+    plain, _ = street()
+    assert plain.as_recorded is plain
+
+
+def test_a_moved_scene_that_travels_to_another_process_still_shares_its_recorded_one() -> None:
+    moved, _ = moved_street()
+    there = pickle.loads(pickle.dumps(moved))
+    assert there.as_recorded is there.recorded
+    assert there.moved_instances == moved.moved_instances
+    assert there.boxes(1).track_ids == moved.boxes(1).track_ids

@@ -101,7 +101,9 @@ def test_resampled_scores_follow_the_formulas_of_scores():
         )
         for _ in range(2)
     )  # fmt: skip
-    means = ours.means(theirs)
+    theirs.effects["fog"].levels[:, 0] = 0.0  # no gain over it, in this resample
+    with np.errstate(divide="ignore"):
+        means = ours.means(theirs)
     for k in range(5):
         rows, base_rows = (
             {

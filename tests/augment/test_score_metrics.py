@@ -378,8 +378,17 @@ def test_robustness_without_a_clean_hit_or_a_fitting_baseline_is_refused():
         summarize({"fog": EffectValues(0.0, (0.0, 0.0))})
     with pytest.raises(ScoreError, match=r"lacks effects, or levels of them: fog"):
         summarize(effects, {"fog": EffectValues(0.8, (0.6,))})
-    with pytest.raises(ScoreError, match=r"makes no error"):
-        summarize(effects, {"fog": EffectValues(1.0, (1.0, 1.0))})
+
+
+def test_means_against_a_baseline_are_over_the_effects_in_which_it_can_be_compared():
+    effects = {"fog": EffectValues(0.8, (0.6, 0.4)), "rain": EffectValues(0.8, (0.8, 0.6))}
+    blind = {"fog": EffectValues(0.8, (0.0, 0.0)), "rain": EffectValues(0.8, (0.4, 0.4))}
+    assert effects["fog"].relative_gain(blind["fog"]) is None
+    assert summarize(effects, blind).mean_relative_gain == pytest.approx(1.4 / 0.8 - 1)
+    perfect = {"fog": EffectValues(1.0, (1.0, 1.0)), "rain": EffectValues(0.8, (0.4, 0.4))}
+    assert effects["fog"].corruption_error(perfect["fog"]) is None
+    assert summarize(effects, perfect).mean_corruption_error == pytest.approx(0.6 / 1.2)
+    assert summarize({"fog": effects["fog"]}, blind).mean_relative_gain is None
 
 
 def test_half_recall_is_interpolated_over_the_logarithm():

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
 import torch
 
-from adapters.base import open_scene
-from tools.bench import detector
 from tools.bench.detection import (
     CELL_PX,
     DISTANCE_UNIT_PX,
@@ -32,13 +29,11 @@ from tools.bench.detector import (
     CLEAR,
     FULL_CASE,
     LEARNT_WEATHER,
-    QUICK_CASE,
     UNKNOWN_EFFECTS,
     draw_recipe,
-    measure,
     objects_of,
 )
-from tools.bench.detector_tables import Hits, draw_curves, largest_rise, pool_hits
+from tools.bench.detector_tables import Hits, largest_rise, pool_hits
 from tools.bench.segmentation import TrainingSettings, one_deterministic_thread
 
 SIZE = (48, 64)
@@ -210,31 +205,3 @@ def test_one_arm_learns_weather_and_none_learns_floods_or_drops():
     for kind in LEARNT_WEATHER:
         recipe = draw_recipe(kind, 0)
         assert recipe.weather.flood is None and recipe.camera.lens_drops is None
-
-
-TINY_CASE = dataclasses.replace(
-    QUICK_CASE,
-    train_scenes=QUICK_CASE.train_scenes[:1],
-    settings=dataclasses.replace(QUICK_CASE.settings, steps=100),
-    effects=("fog",),
-    levels=(5,),
-)
-
-
-def refuse_scene(uri):
-    """A scene loader for runs that have all images."""
-    raise AssertionError(f"{uri} was opened again")
-
-
-@pytest.mark.long
-def test_a_second_run_renders_nothing_and_gives_the_same_scores(tmp_path):
-    first = measure(folder=tmp_path, case=TINY_CASE, scene_loader=open_scene)
-    second = measure(folder=tmp_path, case=TINY_CASE, scene_loader=refuse_scene)
-    assert second["tables"][:-1] == first["tables"][:-1]
-    assert set(first["facts"]["scores"]) == {*ARMS}
-    curve = first["facts"]["curves"]["clean"]["fog"]
-    assert [point["variant"] for point in curve] == ["clean-0", "fog-5"]
-    json.dumps(first)
-    titles = {name: arm.title for name, arm in detector.ARMS.items()}
-    draw_curves(tmp_path / "curves.png", first["facts"]["curves"], titles)
-    assert (tmp_path / "curves.png").stat().st_size > 1000
