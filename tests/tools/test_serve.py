@@ -313,6 +313,9 @@ def test_the_recording_car_is_put_in_front_where_a_mask_is_asked_for(server):
     masked = decode_image(server.stub.render_rgb(request).image_bytes)
     assert not masked[CAR_ROW:].any()  # a street has no photos, so that the car is black
     assert np.array_equal(masked[:CAR_ROW], bare[:CAR_ROW])
+    longer = changed(request, camera_intrinsics__opencv_pinhole_param__focal_length_x=200.0)
+    code, text = refusal(server.stub.render_rgb, longer)
+    assert code == "INVALID_ARGUMENT" and "recorded lens" in text
     request.ego_mask_id.rig_config_id = "hyperion8"
     code, text = refusal(server.stub.render_rgb, request)
     assert code == "NOT_FOUND" and "'street' has masks of front" in text

@@ -80,7 +80,7 @@ def requested_camera(request: Any, facts: SceneFacts, max_pixels: int) -> Camera
         recorded = recorded.resized(spec_width, spec_height)
         is_same_pose = is_within_rounding(camera.world_from_camera, recorded.world_from_camera)
         is_same_shutter = _is_same_shutter(camera.shutter, recorded.shutter)
-        if is_same_pose and is_same_shutter and _has_same_intrinsics(camera, recorded):
+        if is_same_pose and is_same_shutter and has_same_intrinsics(camera, recorded):
             camera = recorded
         elif recorded.timestamp_ns != camera.timestamp_ns:
             # Digits below a microsecond choose the colours and moving objects of the image.
@@ -167,7 +167,7 @@ def _is_same_shutter(first: RollingShutter | None, second: RollingShutter | None
     )
 
 
-def _has_same_intrinsics(first: Camera, second: Camera) -> bool:
+def has_same_intrinsics(first: Camera, second: Camera) -> bool:
     """Return True if two cameras of the same size have the same numbers and lens."""
     return first.lens == second.lens and all(
         math.isclose(a, b, rel_tol=_SAME_INTRINSICS)

@@ -31,7 +31,7 @@ from augment.scene.scene import Scene
 from recipes.errors import RecipeError
 from recipes.schema import Recipe
 from tools.serve.actors import RequestedScene, requested_scene
-from tools.serve.cameras import available_camera, requested_camera
+from tools.serve.cameras import available_camera, has_same_intrinsics, requested_camera
 from tools.serve.drawing import DrawingThreads, check_format, encode_for
 from tools.serve.errors import RequestEnded, RequestRefused, invalid, quote_text
 from tools.serve.lidar import requested_sweep
@@ -412,12 +412,19 @@ def _check_ego_mask(request: Any, opened: OpenScene, camera: Camera) -> None:
     facts = opened.facts
     names = facts.masked_cameras
     if mask_id.rig_config_id == facts.name and mask_id.camera_logical_id in names:
-        if mask_id.camera_logical_id == camera.name:
-            return
-        raise invalid(
-            f"ego_mask_id names camera {quote_text(mask_id.camera_logical_id)}, and the image is "
-            f"of camera {quote_text(camera.name)}"
-        )
+        if mask_id.camera_logical_id != camera.name:
+            raise invalid(
+                f"ego_mask_id names camera {quote_text(mask_id.camera_logical_id)}, and the image "
+                f"is of camera {quote_text(camera.name)}"
+            )
+        recorded = next(c.camera for c in facts.cameras if c.camera.name == camera.name)
+        if not has_same_intrinsics(camera, recorded.resized(camera.width, camera.height)):
+            raise invalid(
+                f"the mask of the recording car is known through the recorded lens of camera "
+                f"{camera.name!r} only: ask for it with the camera_intrinsics of "
+                f"get_available_cameras"
+            )
+        return
     camera_names = ", ".join(names) or "no camera"
     raise RequestRefused(
         grpc.StatusCode.NOT_FOUND,
