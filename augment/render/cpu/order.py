@@ -41,7 +41,7 @@ _MIN_FAINT_SHARE = 0.1
 _BITS_PER_AXIS = 10
 # Relative rounding margin of a sum's terms: a hundred times that of float32.
 _ROUNDING = 1e-5
-# Pixels by which a splat's light may be higher than its box, for fog that thins with height.
+# Pixels by which a splat may exceed its box; 1.9 of it is the blur, as in augment.scene.bounds.
 _BLUR_PX = 3.0
 
 # ---- Values of tensors, cached as long as the tensors live and do not change ---------------------
