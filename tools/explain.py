@@ -16,6 +16,7 @@ from augment.dataset.label_files import forecast_labels
 from augment.errors import ClimateGSError
 from augment.render.threads import num_kernel_threads
 from augment.scene.cameras import Camera
+from augment.scene.pinhole_views import covering_camera
 from augment.scene.scene import Scene
 from augment.scene.scene_times import scene_times
 from augment.timing import stopwatch
@@ -211,7 +212,7 @@ def measure_parts(recipe: Recipe, scene: Scene, count: int = VIEWS) -> list[dict
     for in_scene in plan.active_effects(scene):
         effect = in_scene.hooks
         recipes_without = effect.without_parts(in_scene, recipe)
-        views = [effect.count_parts(in_scene, camera) for camera in cameras]
+        views = [effect.count_parts(in_scene, covering_camera(camera)) for camera in cameras]
         counts = {
             name: _mean_counts([view[name] for view in views])
             for name in recipes_without

@@ -19,6 +19,8 @@ from augment.effects.snow.effect import SnowEffect
 from augment.effects.spray.effect import SprayEffect
 from augment.effects.style.effect import StyleEffect
 from augment.effects.wet.effect import WetEffect
+from augment.scene.pinhole_scene import pinhole_scene
+from augment.scene.pinhole_views import covering_camera
 from augment.scene.scene_times import scene_times
 from recipes.schema import add_section, remove_section
 
@@ -53,6 +55,10 @@ def precompute_effects(context: JobContext, *, only_files: bool = False) -> None
         StyleError: a style cannot be used.
         RecipeError: a timeline goes beyond the scene's drive.
     """
+    cameras = context.cameras
+    if cameras is not None:
+        cameras = [c if c.is_orthographic else covering_camera(c) for c in cameras]
+    context = replace(context, scene=pinhole_scene(context.scene), cameras=cameras)
     times = scene_times(context.scene)
     recipes = [state for recipe in context.recipes for state in recipe.over_time(times)]
     context = replace(context, recipes=recipes)

@@ -327,8 +327,13 @@ class FisheyeLens:
         _check_numbers("radial", self.radial, 4)
         _check_limit(self.limit_rad)
 
-    @functools.cached_property
+    @property
     def max_angle_rad(self) -> float:
+        """Return the angle to the optical axis beyond which the lens shows nothing."""
+        return self._max_angle_rad
+
+    @functools.cached_property
+    def _max_angle_rad(self) -> float:
         """Return `limit_rad`, or the smaller angle at which the polynomial turns back."""
         slope = [(2 * i + 1) * k for i, k in enumerate((1.0, *self.radial))]
         return min(self.limit_rad, math.sqrt(_first_root(slope, math.pi**2)))
@@ -445,8 +450,13 @@ class FThetaLens:
         slope = self._reference_polynomial[1]
         return slope if self.reference == "angle_to_distance" else 1 / slope
 
-    @functools.cached_property
+    @property
     def max_angle_rad(self) -> float:
+        """Return the angle to the optical axis beyond which the lens shows nothing."""
+        return self._max_angle_rad
+
+    @functools.cached_property
+    def _max_angle_rad(self) -> float:
         """Return `limit_rad`, or the smaller angle at which the reference turns back."""
         if self.reference == "angle_to_distance":
             return self._max_argument

@@ -34,6 +34,8 @@ from augment.render.buffers import ALPHA, AUTO, DEPTH_ESTIMATORS, EXPECTED_DEPTH
 from augment.render.constants import RasterSettings
 from augment.scene.bounds import actor_boxes, find_visible_owners
 from augment.scene.cameras import Camera
+from augment.scene.pinhole_scene import pinhole_scene
+from augment.scene.pinhole_views import covering_camera
 from augment.scene.scene import Scene
 from augment.scene.scene_times import scene_times
 from recipes.errors import RecipeError
@@ -421,12 +423,16 @@ def plan_view(plan: Plan, scene: Scene, camera: Camera, *, backend: str = AUTO) 
     Args:
         plan: the plan of all views.
         scene: the scene.
-        camera: the view, at the resolution to render.
+        camera: the view, at the resolution to render. The plan of a camera with a lens is that of
+            a pinhole that looks the same way; each of its views gets a plan of its own.
         backend: the rasteriser's backend.
 
     Raises:
         SceneError: an effect is not possible in this scene.
     """
+    if not (camera.is_pinhole or camera.is_orthographic):
+        scene = pinhole_scene(scene)
+        camera = covering_camera(camera)
     active_effects = plan.active_effects(scene, backend=backend)
     effect_cameras = [
         effect_camera

@@ -23,6 +23,7 @@ from augment.render.buffers import AUTO, SPLAT_IDS
 from augment.scene.boxes import EDGES, WorldBoxes
 from augment.scene.cameras import Camera, Frame
 from augment.scene.geometry import invert_rigid, rigid, rotmat_from_quat
+from augment.scene.pinhole_views import covering_camera
 from augment.scene.scene import Scene
 from augment.scene.semantics import SemanticClass
 from augment.view.plan import plan_at
@@ -229,7 +230,8 @@ def draw(
 def _draw_splat_ids(scene: Scene, camera: Camera, recipe: Recipe, backend: str) -> PageImage:
     recipe = with_unchecked_field(recipe, "output.semantic", True)
     _, plan = plan_at(recipe, scene, camera.timestamp_ns)
-    view = render_buffers(scene, camera.scaled(recipe.render.scale), plan, backend=backend)
+    pinhole = covering_camera(camera.scaled(recipe.render.scale))
+    view = render_buffers(scene, pinhole, plan, backend=backend)
     ids = getattr(view.raster, SPLAT_IDS).cpu().numpy()
     rgb = np.where(ids[..., None] >= 0, color_numbers(ids), 0).astype(np.uint8)
     depth = None if view.depth_m is None else view.depth_m.float().cpu().numpy()
