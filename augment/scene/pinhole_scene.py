@@ -23,9 +23,9 @@ def pinhole_scene(scene: Scene) -> Scene:
     shares the scene's memo, since nothing is computed with the cameras as they are.
     """
     with _lock:
-        known = _scenes.get(scene)
-        if known is not None:
-            return known
+        changed = _scenes.get(scene)
+        if changed is not None:
+            return changed
         frames = _pinhole_frames(scene.frames)
         seen_frames = None if scene.seen_frames is None else _pinhole_frames(scene.seen_frames)
         if frames is scene.frames and seen_frames is scene.seen_frames:
