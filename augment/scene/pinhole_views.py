@@ -214,7 +214,8 @@ def pixel_rays(
         error = np.abs(pixels - np.stack(np.meshgrid(columns[::5], rows[::5]), -1))
         if is_inside.all() and error.max() <= _MAX_RAY_ERROR_PX:
             return rays, np.ones((height, width), bool)
-    return lens.rays(np.stack(np.meshgrid(columns, rows), -1), intrinsics)
+    pixels = np.stack(np.meshgrid(columns, rows), -1).astype(np.float64)
+    return lens.rays(pixels, intrinsics)
 
 
 def _coarse_places(size: int) -> Float64[np.ndarray, " N"]:
