@@ -392,10 +392,10 @@ def _outline_through_lens(boxes: WorldBoxes, camera: Camera) -> Outlines:
     truncated_fraction = np.where(boxes.is_usable, 1.0, np.nan)
     for number in np.flatnonzero(in_view):
         is_projected = pieces.is_shown[number]
-        whole = np.concatenate(
+        edge_points = np.concatenate(
             [pieces.first[number][is_projected], pieces.second[number][is_projected]]
         )
-        area = _hull_area(whole) if len(whole) else 0.0
+        area = _hull_area(edge_points) if len(edge_points) else 0.0
         shown_area = _hull_area(points[number][is_shown[number]])
         truncated_fraction[number] = min(max(1 - shown_area / area, 0.0), 1.0) if area > 0 else 0.0
     return Outlines(xyxy, in_view, truncated_fraction)

@@ -155,8 +155,8 @@ def count_pixels_through_lens(
         near_m: depth below which a box is not seen.
     """
     num_boxes = len(windows)
-    shown = [np.zeros((2, 0), np.int64) for _ in range(num_boxes)]
-    hidden = np.zeros(num_boxes, np.int64)
+    shown_pixels = [np.zeros((2, 0), np.int64) for _ in range(num_boxes)]
+    num_hidden = np.zeros(num_boxes, np.int64)
     owners = np.zeros(depth_m.shape, np.uint16)
     owner_volumes = np.full(depth_m.shape, np.inf)
     volumes = np.prod(frames.labelled_m[:, 1] - frames.labelled_m[:, 0], axis=1)
@@ -165,7 +165,7 @@ def count_pixels_through_lens(
         actor_rows = np.zeros((2, 0), np.int64)
         if actors[box] > 0 and instance.size:
             actor_rows = np.stack(np.nonzero(instance == actors[box]))
-            shown[box] = actor_rows
+            shown_pixels[box] = actor_rows
         if left >= right or top >= bottom:
             continue
         window = (slice(top, bottom), slice(left, right))
@@ -178,21 +178,21 @@ def count_pixels_through_lens(
         is_other = (z > 0) & ~((actors[box] > 0) & (pixel_actors == actors[box]))
         is_in = is_other & (nearest <= z) & (z <= farthest)
         meets = enter <= leave
-        hidden[box] = np.count_nonzero(is_in & (pixel_actors > 0) & meets)
-        hidden[box] += np.count_nonzero(is_other & (z < nearest) & meets)
+        num_hidden[box] = np.count_nonzero(is_in & (pixel_actors > 0) & meets)
+        num_hidden[box] += np.count_nonzero(is_other & (z < nearest) & meets)
         if actors[box] == 0:
             is_shown = is_in & (pixel_actors == 0)
             if scenery.size:
                 is_shown &= ~scenery[window]
             rows, columns = np.nonzero(is_shown)
-            shown[box] = np.stack([rows + top, columns + left])
+            shown_pixels[box] = np.stack([rows + top, columns + left])
             is_smaller = volumes[box] < owner_volumes[rows + top, columns + left]
             place = (rows[is_smaller] + top, columns[is_smaller] + left)
             owners[place] = box + 1
             owner_volumes[place] = volumes[box]
     counts = np.zeros((num_boxes, 6), np.int64)
-    counts[:, 1] = hidden
-    for box, (rows, columns) in enumerate(shown):
+    counts[:, 1] = num_hidden
+    for box, (rows, columns) in enumerate(shown_pixels):
         counts[box, 0] = len(rows)
         if len(rows):
             counts[box, 2:] = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1

@@ -25,9 +25,9 @@ def pinhole_scene(scene: Scene) -> Scene:
     """
     recorded = None if scene.recorded is None else pinhole_scene(scene.recorded)
     with _lock:
-        known = _scenes.get(scene)
-        if known is not None:
-            return known
+        changed = _scenes.get(scene)
+        if changed is not None:
+            return changed
         if recorded is not None and scene.recorded and scene.frames is scene.recorded.frames:
             frames = recorded.frames
         else:

@@ -114,18 +114,18 @@ class LensLayout:
         return np.argmax([view.weights for view in self.views], axis=0)
 
 
-def layout_of(camera: Camera, whole: Camera | None = None) -> LensLayout:
+def layout_of(camera: Camera, whole_camera: Camera | None = None) -> LensLayout:
     """Return the pinhole views that cover the picture of a camera with a lens.
 
     Args:
         camera: the camera; its pose and shutter do not matter.
-        whole: the camera of whose image `camera` is a window. The window is looked up in views with
-            the directions and resolutions of the whole image's, so that both look alike.
+        whole_camera: the camera of whose image `camera` is a window. The window is looked up in
+            views with the directions and resolutions of the whole image's, so that both look alike.
 
     Raises:
         ValueError: no pixel of the camera sees anything.
     """
-    views = () if whole is None else layout_of(whole).views
+    views = () if whole_camera is None else layout_of(whole_camera).views
     assert camera.lens is not None
     return _make_layout(
         camera.lens, camera.intrinsics, camera.width, camera.height, camera.name, views
@@ -214,7 +214,8 @@ def pixel_rays(
         error = np.abs(pixels - np.stack(np.meshgrid(columns[::5], rows[::5]), -1))
         if is_inside.all() and error.max() <= _MAX_RAY_ERROR_PX:
             return rays, np.ones((height, width), bool)
-    return lens.rays(np.stack(np.meshgrid(columns, rows), -1), intrinsics)
+    pixels = np.stack(np.meshgrid(columns, rows), -1).astype(np.float64)
+    return lens.rays(pixels, intrinsics)
 
 
 def _coarse_places(size: int) -> Float64[np.ndarray, " N"]:

@@ -131,7 +131,7 @@ def project_points(
     span = before - after
     part = np.clip(before / np.where(np.abs(span) > 0, span, 1.0), 0.0, 1.0)[:, None]
     out = (1 - part) * pixels[last, number] + part * pixels[last + 1, number]
-    return out, ~np.isnan(out).any(-1)
+    return out, ~np.isnan(out[:, 0])
 
 
 def _project(

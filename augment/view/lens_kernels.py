@@ -20,20 +20,20 @@ MAX_SAMPLES = 8
 def _cubic_weights(t, out):
     """Compute the four weights of a Catmull-Rom spline at a share between the middle two."""
     half = np.float32(0.5)
-    one = np.float32(1.0)
+    unit = np.float32(1.0)
     two = np.float32(2.0)
-    out[0] = half * t * (t * (two - t) - one)
+    out[0] = half * t * (t * (two - t) - unit)
     out[1] = half * (t * t * (np.float32(3.0) * t - np.float32(5.0)) + two)
-    out[2] = half * t * (t * (np.float32(4.0) - np.float32(3.0) * t) + one)
-    out[3] = half * t * t * (t - one)
+    out[2] = half * t * (t * (np.float32(4.0) - np.float32(3.0) * t) + unit)
+    out[3] = half * t * t * (t - unit)
 
 
 @kernel_function()
 def _step(pixels, weights, row, column, down, right, out):
     """Compute the change of the place in the view from a pixel to the next one.
 
-    The neighbour before it is taken where the next one is not in the view, and the pixel's own size
-    where neither is.
+    The neighbour before it is taken where the next one is not in the view, and the pixel's own
+    size where neither is.
     """
     height, width = weights.shape
     for sign in (1, -1):
@@ -130,7 +130,7 @@ def look_up_depth(depth, pixels, is_taken, max_spread, out):
     height, width = is_taken.shape
     view_height, view_width = depth.shape
     half = np.float32(0.5)
-    one = np.float32(1.0)
+    unit = np.float32(1.0)
     for row in prange(height):
         for column in range(width):
             if not is_taken[row, column]:
@@ -155,7 +155,7 @@ def look_up_depth(depth, pixels, is_taken, max_spread, out):
                 continue
             a = u - half - np.float32(left)
             b = v - half - np.float32(top)
-            inverse = (one - b) * ((one - a) / depth[top, left] + a / depth[top, left + 1]) + b * (
-                (one - a) / depth[top + 1, left] + a / depth[top + 1, left + 1]
-            )
-            out[row, column] = one / inverse
+            inverse = (unit - b) * (
+                (unit - a) / depth[top, left] + a / depth[top, left + 1]
+            ) + b * ((unit - a) / depth[top + 1, left] + a / depth[top + 1, left + 1])
+            out[row, column] = unit / inverse

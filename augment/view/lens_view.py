@@ -108,8 +108,8 @@ def draw_through_lens(
     if camera.shutter is None:
         return _draw_lens(camera, draw)
     strips = strips_of(camera, num_strips, reaches_beyond=moves_rows)
-    whole = None if camera.lens is None else dataclasses.replace(camera, shutter=None)
-    pictures = [_draw_lens(strip.camera, draw, whole) for strip in strips]
+    whole_camera = None if camera.lens is None else dataclasses.replace(camera, shutter=None)
+    pictures = [_draw_lens(strip.camera, draw, whole_camera) for strip in strips]
     if moves_rows:
         with timed("rolling shutter"):
             rays = pixel_rays_of(camera)
@@ -159,18 +159,20 @@ def strips_of(camera: Camera, num_strips: int, *, reaches_beyond: bool = True) -
     return tuple(strips)
 
 
-def _draw_lens(camera: Camera, draw: DrawPinhole, whole: Camera | None = None) -> ViewPicture:
+def _draw_lens(
+    camera: Camera, draw: DrawPinhole, whole_camera: Camera | None = None
+) -> ViewPicture:
     """Return the picture of a camera without shutter, through its lens if it has one.
 
     Args:
         camera: the camera.
         draw: draws a pinhole view.
-        whole: the camera of whose image this is a window; None for a whole image.
+        whole_camera: the camera of whose image this is a window; None for a whole image.
     """
     if camera.lens is None:
         return draw(camera, 1.0, camera)
     with timed("lens: layout"):
-        layout = layout_of(camera, whole)
+        layout = layout_of(camera, whole_camera)
     pictures = [draw(view.camera_for(camera), view.blur_gain, camera) for view in layout.views]
     with timed("lens"):
         return _merge(layout, pictures, is_along_ray=camera.lens.is_depth_along_ray)
@@ -238,7 +240,7 @@ class _Lookup:
 
     layout: LensLayout
     """The views."""
-    taken: tuple[Bool[np.ndarray, "H W"], ...]
+    taken_masks: tuple[Bool[np.ndarray, "H W"], ...]
     """Pixels that take each view."""
     places: tuple[tuple[np.ndarray, np.ndarray], ...]
     """Rows and columns in each view of the pixels that take it."""
@@ -247,19 +249,19 @@ class _Lookup:
     def of(layout: LensLayout) -> _Lookup:
         """Return the nearest pixels of a layout."""
         main_view = layout.main_view
-        taken = []
+        taken_masks = []
         places = []
         for number, view in enumerate(layout.views):
             is_taken = layout.is_inside & (main_view == number)
             pixels = view.pixels[is_taken].astype(np.int64)
-            taken.append(is_taken)
+            taken_masks.append(is_taken)
             places.append(
                 (
                     np.clip(pixels[:, 1], 0, view.height - 1),
                     np.clip(pixels[:, 0], 0, view.width - 1),
                 )
             )
-        return _Lookup(layout, tuple(taken), tuple(places))
+        return _Lookup(layout, tuple(taken_masks), tuple(places))
 
     def nearest(self, images: Sequence[np.ndarray | None]) -> np.ndarray | None:
         """Return an image of the views at the lens's pixels, 0 where nothing is seen.
@@ -271,7 +273,7 @@ class _Lookup:
         if first is None:
             return None
         out = np.zeros(self.layout.is_inside.shape, first.dtype)
-        for image, is_taken, place in zip(images, self.taken, self.places, strict=True):
+        for image, is_taken, place in zip(images, self.taken_masks, self.places, strict=True):
             if image is not None:
                 out[is_taken] = image[place]
         return out
@@ -288,7 +290,7 @@ class _Lookup:
         if any(image is None for image in images):
             return None
         out = np.zeros(self.layout.is_inside.shape, np.float32)
-        for view, image, is_taken in zip(self.layout.views, images, self.taken, strict=True):
+        for view, image, is_taken in zip(self.layout.views, images, self.taken_masks, strict=True):
             assert image is not None
             z = np.ascontiguousarray(image)
             with kernel_threads(_PIXELS_PER_THREAD):

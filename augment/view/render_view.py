@@ -271,7 +271,7 @@ def _record_picture(
     camera: Camera,
     plan: Plan,
     view: ViewPlan,
-    drawn: RenderedView,
+    picture: RenderedView,
     color_map: Tensor | None,
     backend: str,
 ) -> RenderedView:
@@ -282,11 +282,11 @@ def _record_picture(
         camera: the view.
         plan: the plan of all views.
         view: the plan of this view.
-        drawn: the picture.
+        picture: the picture.
         color_map: the camera's colour map, [3, 4]; None without one.
         backend: as for `rasterize`.
     """
-    rendered = drawn
+    rendered = picture
     rgb = rendered.rgb
     # A camera exposes what the weather has left, so this comes last if no effect needs it before.
     if color_map is not None and _first_exposed(view) is None:
