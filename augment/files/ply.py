@@ -87,6 +87,12 @@ class PlyHeader:
         names = ", ".join(repr(e.name) for e in self.elements) or "none"
         raise SceneError(f"{self.path}: expected an element {name!r} in the .ply; found {names}")
 
+    @property
+    def notes(self) -> dict[str, str]:
+        """Return the comments of the form `key: value`."""
+        pairs = (comment.partition(":") for comment in self.comments)
+        return {key.strip(): value.strip() for key, colon, value in pairs if colon}
+
     def row_dtype(self, element: PlyElement) -> np.dtype:
         """Return the type of the rows that `iterate_rows` yields."""
         if self.byte_order == "ascii":
@@ -384,8 +390,6 @@ def _has_wide_means(header: PlyHeader, table: PlyElement) -> bool:
 
 def _guess_content(header: PlyHeader, names: set[str]) -> str:
     """Return a sentence about a .ply without the columns of Gaussians."""
-    if "packed_position" in names:
-        return "This is SuperSplat's compressed layout: export it as uncompressed .ply."
     if any(e.name in ("face", "tristrips") for e in header.elements):
         return "This is a mesh; a trained 3D Gaussian splat is needed."
     if "scale_0" in names and "scale_2" not in names:
@@ -451,9 +455,7 @@ def read_ply(
         semantic=None if semantic is None else torch.from_numpy(semantic),
     )
     gaussians, problems = check_gaussians(gaussians, where=str(header.path))
-    pairs = (comment.partition(":") for comment in header.comments)
-    notes = {key.strip(): value.strip() for key, colon, value in pairs if colon}
-    return SplatFile(gaussians, origin, notes, (*problems, *header.surplus_problems()))
+    return SplatFile(gaussians, origin, header.notes, (*problems, *header.surplus_problems()))
 
 
 def _looks_activated(scales: Tensor, opacities: Tensor) -> bool:

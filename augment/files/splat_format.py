@@ -64,7 +64,8 @@ class SplatFormat:
     """A format of splat files.
 
     A file has the format if it begins with one of `first_bytes`, or is named as one of
-    `file_names`. If the format has no `first_bytes`, its suffixes tell.
+    `file_names`. If the format has no `first_bytes`, its suffixes tell. Formats that share their
+    first bytes are told apart by `fits_content`.
     """
 
     name: str  # for messages, such as ".spz"
@@ -72,6 +73,8 @@ class SplatFormat:
     suffixes: tuple[str, ...] = ()  # lower case; files with them are splat files of a folder
     first_bytes: tuple[bytes, ...] = ()
     file_names: tuple[str, ...] = ()
+    # Returns True if a file with these first bytes has this format.
+    fits_content: Callable[[Path], bool] = lambda path: True
     option: str = ""  # the one option of `read_splats` that the reader takes
     writer: SplatWriter | None = None
 
