@@ -10,7 +10,8 @@ Source: github.com/playcanvas/splat-transform, src/lib/readers/decompress-ply.ts
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -57,17 +58,22 @@ def read_compressed_ply(path: str | Path) -> SplatFile:
     ranges = _read_ranges(header, has_color_ranges=has_color_ranges)
     pieces = iterate_rows(header, "vertex")
     first_piece = next(pieces)  # checks the file's length before arrays are allocated
+    sh_pieces: Iterator[np.ndarray | None] = itertools.repeat(None)
     if has_sh:
         sh_pieces = iterate_rows(header, "sh")
-        first_sh = next(sh_pieces)
+    first_sh = next(sh_pieces)
     means = np.empty((table.count, 3), np.float32)
     quats = np.empty((table.count, 4), np.float32)
     scales = np.empty((table.count, 3), np.float32)
     opacities = np.empty(table.count, np.float32)
     sh = np.empty((table.count, num_sh, 3), np.float32)
     start = 0
-    for packed in (first_piece, *pieces) if table.count else ():
+    all_pieces = zip(
+        itertools.chain([first_piece], pieces), itertools.chain([first_sh], sh_pieces), strict=False
+    )
+    for packed, sh_rows in all_pieces:  # pieces of both have the same number of rows
         rows = slice(start, start + len(packed))
+        start = rows.stop
         chunks = np.arange(rows.start, rows.stop) // _ROWS_PER_CHUNK
         position, rotation, scale, color = (
             packed[name].astype(np.uint32, copy=False) for name in _PACKED_COLUMNS
@@ -75,18 +81,14 @@ def read_compressed_ply(path: str | Path) -> SplatFile:
         for axis, (shift, bits) in enumerate(_RANGE_BITS):
             for codes, name, values in ((position, "position", means), (scale, "scale", scales)):
                 values[rows, axis] = _in_range(codes, shift, bits, ranges[name], axis, chunks)
+        np.exp(scales[rows], out=scales[rows])
         for channel, shift in enumerate(_COLOUR_SHIFTS):
-            sh[rows, 0, channel] = _in_range(color, shift, 8, ranges["color"], channel, chunks)
+            rgb = _in_range(color, shift, 8, ranges["color"], channel, chunks)
+            sh[rows, 0, channel] = (rgb - np.float32(0.5)) / np.float32(SH_C0)
         opacities[rows] = (color & np.uint32(255)).astype(np.float32) / np.float32(255)
         quats[rows] = _decode_quats(rotation)
-        start = rows.stop
-    np.exp(scales, out=scales)
-    sh[:, 0] = (sh[:, 0] - np.float32(0.5)) / np.float32(SH_C0)
-    if has_sh:
-        start = 0
-        for rows in (first_sh, *sh_pieces):
-            sh[start : start + len(rows), 1:] = _decode_sh(rows, num_sh - 1)
-            start += len(rows)
+        if sh_rows is not None:
+            sh[rows, 1:] = _decode_sh(sh_rows, num_sh - 1)
     all_gaussians = Gaussians(
         means=torch.from_numpy(means),
         quats=torch.from_numpy(quats),
@@ -194,15 +196,17 @@ def _decode_quats(codes: np.ndarray) -> np.ndarray:
 
 def _decode_sh(rows: np.ndarray, num_terms: int) -> np.ndarray:
     """Decode coefficients beyond the first, float32 [N, K, 3]."""
-    fractions = (np.arange(256) + 0.5) / 256
-    fractions[[0, 255]] = (0, 1)
-    value_of_code = ((fractions - 0.5) * _SH_RANGE).astype(np.float32)
     if rows.dtype.itemsize == 3 * num_terms:
         codes = np.ascontiguousarray(rows).view("u1").reshape(len(rows), 3 * num_terms)
     else:  # text
         codes = np.stack([rows[name] for name in rows.dtype.names or ()], axis=1)
         codes = codes.clip(0, 255).astype(np.uint8)
-    return value_of_code[codes].reshape(len(rows), 3, num_terms).transpose(0, 2, 1)
+    values = codes.astype(np.float32)
+    values *= np.float32(_SH_RANGE / 256)
+    values += np.float32(_SH_RANGE / 512 - _SH_RANGE / 2)  # the middles of 256 steps
+    values[codes == 0] = -_SH_RANGE / 2  # but for the first and the last
+    values[codes == 255] = _SH_RANGE / 2
+    return values.reshape(len(rows), 3, num_terms).transpose(0, 2, 1)
 
 
 COMPRESSED_PLY = SplatFormat(
