@@ -32,11 +32,15 @@ def splat_formats() -> tuple[SplatFormat, ...]:
     from augment.files.ply import PLY
     from augment.files.sog import SOG
     from augment.files.splat import SPLAT
+    from augment.files.splat_checkpoint import CHECKPOINT
     from augment.files.spz import SPZ
     from augment.files.streamed_sog import STREAMED_SOG
     from augment.files.usd import USD
 
-    return (COMPRESSED_PLY, PLY, SPLAT, KSPLAT, SPZ, SOG, GLB, GLTF, USD, STREAMED_SOG)
+    return (
+        *(COMPRESSED_PLY, PLY, SPLAT, KSPLAT, SPZ, CHECKPOINT, SOG, GLB, GLTF, USD),
+        STREAMED_SOG,
+    )
 
 
 def splat_suffixes() -> tuple[str, ...]:
@@ -66,8 +70,9 @@ def read_splats(
 ) -> SplatFile:
     """Read a splat file of any format that is supported.
 
-    Formats are recognised by the first bytes (.ply, .spz, .sog, .glb), the name (.splat, .ksplat,
-    .gltf, .usd), the meta.json of a SOG folder, or the lod-meta.json of a streamed one.
+    Formats are recognised by the first bytes (.ply, .spz, .sog, .glb, checkpoints), the name
+    (.splat, .ksplat, .gltf, .usd), the meta.json of a SOG folder, or the lod-meta.json of a
+    streamed one.
 
     Args:
         path: the file.
