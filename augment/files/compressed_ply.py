@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from augment.errors import SceneError
-from augment.files.ply import PlyHeader, iterate_rows, read_ply_header
+from augment.files.ply import PlyHeader, describe_ply_header, iterate_rows, read_ply_header
 from augment.files.splat_format import SplatFile, SplatFormat
 from augment.render.sh import SH_C0
 from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
@@ -214,4 +214,6 @@ COMPRESSED_PLY = SplatFormat(
     reader=read_compressed_ply,
     first_bytes=(b"ply\n", b"ply\r"),
     fits_content=is_compressed_ply,
+    describe=describe_ply_header,
+    viewer_up="-y",
 )

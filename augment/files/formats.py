@@ -85,7 +85,7 @@ def read_splats(
     """
     path = Path(path)
     try:
-        splat_format = _format_of(path)
+        splat_format = find_format(path)
         options = {"level": level, "activated": activated}
         stated_options = {name: value for name, value in options.items() if value is not None}
         for name in stated_options:
@@ -109,7 +109,7 @@ _OPTION_ERRORS = {
 }
 
 
-def _format_of(path: Path) -> SplatFormat | None:
+def find_format(path: Path) -> SplatFormat | None:
     """Return the format of a file; None if neither its first bytes nor its name tell."""
     if not path.is_file():
         raise SceneError(f"{path}: no such file; expected a {splat_names()}")

@@ -39,6 +39,7 @@ from pydantic import (
 from augment.errors import SceneError
 from augment.files.limits import check_memory, parse_json_object
 from augment.files.splat_format import (
+    FileFacts,
     Loss,
     SplatFile,
     SplatFormat,
@@ -631,9 +632,35 @@ def write_glb(path: str | Path, gaussians: Gaussians) -> None:
             file.write(array.tobytes())
 
 
+def describe_gltf(path: Path) -> FileFacts:
+    """Return the facts of a glTF file's JSON."""
+    document = _File(path).document
+    generator = document.asset.get("generator", "")
+    names = {
+        name
+        for mesh in document.meshes
+        for primitive in mesh.primitives
+        if primitive.extensions.KHR_gaussian_splatting is not None
+        for name in primitive.extensions.KHR_gaussian_splatting.extensions
+    }
+    warnings = []
+    if names:
+        warnings.append(
+            f"splats are stored by {', '.join(sorted(names))}, a draft: viewers of the ratified "
+            f"{EXTENSION} show nothing"
+        )
+    return FileFacts(
+        version=f"glTF {document.asset.get('version')}",
+        writer=generator[:80] if isinstance(generator, str) else "",
+        **NOTES,
+        warnings=tuple(warnings),
+    )
+
+
 _AXES = "its unit is the metre, y points up in it; cameras are left out"
 GLB = SplatFormat(
     name=".glb",
+    describe=describe_gltf,
     reader=read_gltf,
     suffixes=(".glb",),
     first_bytes=(_GLB_MARK,),
@@ -650,4 +677,4 @@ GLB = SplatFormat(
         ),
     ),
 )
-GLTF = SplatFormat(name=".gltf", reader=read_gltf, suffixes=(".gltf",))
+GLTF = SplatFormat(name=".gltf", reader=read_gltf, suffixes=(".gltf",), describe=describe_gltf)

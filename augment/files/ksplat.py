@@ -21,7 +21,7 @@ import torch
 
 from augment.errors import SceneError
 from augment.files.limits import check_memory, row_slices
-from augment.files.splat_format import SplatFile, SplatFormat
+from augment.files.splat_format import FileFacts, SplatFile, SplatFormat
 from augment.render.sh import SH_C0
 from augment.scene.scene import Gaussians, check_gaussians
 
@@ -255,4 +255,19 @@ def _decode_sh(codes: np.ndarray, layout: _Layout, terms: np.ndarray) -> None:
             terms[:, first:last] += np.float32(layout.least_sh)
 
 
-KSPLAT = SplatFormat(name=".ksplat", reader=read_ksplat, suffixes=(".ksplat",))
+def describe_ksplat(path: Path) -> FileFacts:
+    """Return the facts of a .ksplat's headers."""
+    with path.open("rb") as file:
+        layout, sections = _read_headers(path, file, path.stat().st_size)
+    return FileFacts(
+        version=f"version 0.1, compression level {layout.level}, {len(sections)} sections"
+    )
+
+
+KSPLAT = SplatFormat(
+    name=".ksplat",
+    reader=read_ksplat,
+    suffixes=(".ksplat",),
+    describe=describe_ksplat,
+    viewer_up="-y",
+)

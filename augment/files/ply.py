@@ -18,7 +18,14 @@ import torch
 from torch import Tensor
 
 from augment.errors import SceneError
-from augment.files.splat_format import SplatFile, SplatFormat, SplatWriter, recentring_origin
+from augment.files.splat_format import (
+    FileFacts,
+    SplatFile,
+    SplatFormat,
+    SplatWriter,
+    recentring_origin,
+    writer_in,
+)
 from augment.output.atomic import write_file_atomically
 from augment.render.sh import SH_C0
 from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
@@ -511,8 +518,36 @@ def _file_columns(part: Gaussians) -> dict[str, np.ndarray]:
     return _columns_of({name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()})
 
 
+def describe_ply_header(path: Path) -> FileFacts:
+    """Return the facts of a .ply's header."""
+    header = read_ply_header(path)
+    orders = {"<": "binary, little endian", ">": "binary, big endian", "ascii": "text"}
+    warnings = []
+    table = next((e for e in header.elements if e.name == "vertex"), PlyElement("", 0))
+    wide_axes = [axis for axis in "xyz" if table.columns.get(axis) == "f8"]
+    if wide_axes:
+        warnings.append(
+            f"{', '.join(wide_axes)} are doubles: most viewers read floats only, and take the "
+            "columns behind them for others"
+        )
+    if "red" in table.columns and "f_dc_0" not in table.columns:
+        warnings.append("colours are red, green, blue: viewers that look for f_dc show it grey")
+    if header.byte_order != "<":
+        warnings.append("most viewers read little-endian binary files only")
+    notes = header.notes
+    return FileFacts(
+        version=orders[header.byte_order],
+        writer=writer_in(header.comments),
+        up=notes.get("up", ""),
+        unit=notes.get("unit", ""),
+        warnings=tuple(warnings),
+    )
+
+
 PLY = SplatFormat(
     name=".ply",
+    describe=describe_ply_header,
+    viewer_up="-y",
     reader=read_ply,
     suffixes=(".ply",),
     first_bytes=(b"ply\n", b"ply\r"),

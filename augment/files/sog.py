@@ -44,6 +44,8 @@ from augment.files.sog_meta import (
     code_numbers,
 )
 from augment.files.splat_format import (
+    ANTIALIASED_WARNING,
+    FileFacts,
     Loss,
     SplatFile,
     SplatFormat,
@@ -559,8 +561,26 @@ def _export(path: Path, gaussians: Gaussians, facts: Mapping[str, str]) -> None:
     write_sog(path, transform_gaussians_rigidly(gaussians, z_to_minus_y, zero), notes=notes)
 
 
+def describe_sog(path: Path) -> FileFacts:
+    """Return the facts of a SOG's meta.json."""
+    with contextlib.closing(_Files(path)) as files:
+        meta = _read_meta(files)
+    if isinstance(meta, SogMetaVersion1):
+        return FileFacts(version="version 1")
+    notes = meta.climategs
+    return FileFacts(
+        version="version 2",
+        writer=meta.asset.generator[:80] or ("ClimateGS" if notes else ""),
+        up=notes.get("up", ""),
+        unit=notes.get("unit", ""),
+        warnings=(ANTIALIASED_WARNING,) if meta.antialias else (),
+    )
+
+
 SOG = SplatFormat(
     name=".sog",
+    describe=describe_sog,
+    viewer_up="-y",
     reader=read_sog,
     suffixes=(SUFFIX,),
     first_bytes=(_ZIP,),

@@ -74,6 +74,12 @@ class Palette(_Part):
     files: _TwoFiles  # images of the entries and of each Gaussian's entry
 
 
+class _Asset(_Part):
+    """Facts about the file."""
+
+    generator: str = ""  # the program that wrote it
+
+
 class SogMeta(_Part):
     """The content of meta.json."""
 
@@ -85,6 +91,8 @@ class SogMeta(_Part):
     sh0: _Coded
     shN: Palette | None = None
     climategs: dict[str, str] = {}
+    asset: _Asset = _Asset()
+    antialias: bool = False  # True if the splats were trained for an antialiasing renderer
 
 
 class _MeansWithShape(_Means):

@@ -21,7 +21,7 @@ from torch import Tensor
 from augment.errors import AdapterError, SceneError
 from augment.files.checkpoints import SettingsRecord, checked_tensor, load_checkpoint
 from augment.files.limits import check_memory
-from augment.files.splat_format import SplatFile, SplatFormat
+from augment.files.splat_format import FileFacts, SplatFile, SplatFormat
 from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
 
 _ZIP = b"PK\x03\x04"  # first bytes of a zip
@@ -178,9 +178,21 @@ def _settings_problems(config: Any, where: str) -> tuple[str, ...]:
     return tuple(problems)
 
 
+def describe_checkpoint(path: Path) -> FileFacts:
+    """Return the trainer of a checkpoint and its step."""
+    try:
+        content = load_checkpoint(path, has_settings=True)
+    except AdapterError as error:
+        raise SceneError(str(error)) from None
+    step = content.get("step", content.get("global_step"))
+    writer = "gsplat" if "splats" in content else "3DGRUT"
+    return FileFacts(version="PyTorch", writer=f"{writer}, step {step}" if step else writer)
+
+
 CHECKPOINT = SplatFormat(
     name="checkpoint (.pt)",
     reader=read_splat_checkpoint,
     first_bytes=(_ZIP,),
     fits_content=is_checkpoint,
+    describe=describe_checkpoint,
 )

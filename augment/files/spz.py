@@ -28,7 +28,15 @@ import torch
 
 from augment.errors import SceneError
 from augment.files.limits import check_memory, row_slices
-from augment.files.splat_format import Loss, SplatFile, SplatFormat, SplatWriter, rotate_z_to_y
+from augment.files.splat_format import (
+    ANTIALIASED_WARNING,
+    FileFacts,
+    Loss,
+    SplatFile,
+    SplatFormat,
+    SplatWriter,
+    rotate_z_to_y,
+)
 from augment.output.atomic import write_file_atomically
 from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
 
@@ -441,8 +449,21 @@ def _encode_sh(sh: np.ndarray) -> np.ndarray:
     return _round_to_bytes(codes)
 
 
+def describe_spz(path: Path) -> FileFacts:
+    """Return the facts of a .spz's header."""
+    with path.open("rb") as file:
+        content = read_spz_stream(file, path.stat().st_size, str(path))
+    warnings = []
+    if content.is_antialiased:
+        warnings.append(ANTIALIASED_WARNING)
+    if content.up != UP:
+        warnings.append(f"its axes are stated by Adobe's record: viewers that skip it take {UP} up")
+    return FileFacts(version=f"version {content.version}", up=content.up, warnings=tuple(warnings))
+
+
 SPZ = SplatFormat(
     name=".spz",
+    describe=describe_spz,
     reader=read_spz,
     suffixes=(".spz",),
     first_bytes=(_GZIP, _MARK),
