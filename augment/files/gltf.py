@@ -294,7 +294,8 @@ class _File:
         accessors = [document.accessors[p.attributes.get("POSITION", 0)] for p in primitives]
         num_gaussians = sum(accessor.count for accessor in accessors)
         views = {a.bufferView for a in accessors if a.bufferView is not None}
-        spz_views = {_spz_view(primitive) for primitive in primitives} - {None}
+        numbers = [_spz_view(primitive) for primitive in primitives]
+        spz_views = {number for number in numbers if number is not None}
         views |= spz_views
         buffer_numbers = {document.bufferViews[view].buffer for view in views}
         sizes = {

@@ -193,11 +193,13 @@ def _read_section(
     lengths = np.frombuffer(file.read(4 * section.num_partial_buckets), "<u4")
     bucket_bytes = file.read(section.bucket_bytes * section.num_buckets)
     row_type = _row_type(layout, section.degree)
+    steps = section.num_steps or _DEFAULT_STEPS[layout.level]
+    step = np.float32(section.bucket_edge / 2 / steps)
+    centres = np.empty((0, 3), np.float32)
+    buckets = np.empty(0, np.int64)
     if layout.level:
         centres = np.frombuffer(bucket_bytes, "<f4").reshape(-1, 3)
         buckets = _buckets_of_rows(path, section, lengths)
-        steps = section.num_steps or _DEFAULT_STEPS[layout.level]
-        step = np.float32(section.bucket_edge / 2 / steps)
     for rows in row_slices(section.num):
         row_bytes = file.read(row_type.itemsize * (rows.stop - rows.start))
         values = np.frombuffer(row_bytes, row_type)

@@ -289,7 +289,7 @@ class _PaletteEntries(NamedTuple):
 class _PaletteShape(NamedTuple):
     """The size of a palette of spherical harmonics."""
 
-    count: int  # entries
+    num_entries: int
     bands: int  # bands of spherical harmonics beyond the first
 
 
@@ -323,7 +323,7 @@ def _palette_entries(
         max_bytes: the largest size of an image of the Gaussians, bytes.
     """
     row_width = _ENTRIES_PER_ROW * NUM_SH_REST[shape.bands]
-    num_rows = -(-shape.count // _ENTRIES_PER_ROW)
+    num_rows = -(-shape.num_entries // _ENTRIES_PER_ROW)
     entries = files.pixels(
         names[0],
         4 * row_width * (num_rows + _ENTRIES_PER_ROW) + _MAX_META_BYTES,
@@ -338,9 +338,10 @@ def _palette_entries(
         :, :2
     ].T
     labels = low_bytes | high_bytes.astype(np.int64) << 8
-    if labels.max() >= shape.count:
+    if labels.max() >= shape.num_entries:
         raise SceneError(
-            f"{files.path}: {names[1]} names entry {labels.max()} of a palette of {shape.count}"
+            f"{files.path}: {names[1]} names entry {labels.max()} of a palette of "
+            f"{shape.num_entries}"
         )
     return _PaletteEntries(entries[..., :3].reshape(-1, row_width // _ENTRIES_PER_ROW, 3), labels)
 

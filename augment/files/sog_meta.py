@@ -153,10 +153,12 @@ def code_numbers(meta: SogMeta | SogMetaVersion1) -> CodeNumbers:
     """Return the numbers that the bytes of the images stand for."""
     with np.errstate(over="ignore", invalid="ignore"):  # infinite ones are left out, and reported
         if isinstance(meta, SogMeta):
-            books = [np.array(book).astype(np.float32) for book in _codebooks(meta)]
-            opacities = (np.arange(256) / 255.0).astype(np.float32)
-            wide_books = [np.repeat(book[:, None], 3, axis=1) for book in books[:2]]
-            return CodeNumbers(*wide_books, opacities, books[2] if meta.shN is not None else None)
+            return CodeNumbers(
+                scales=np.repeat(_as_column(meta.scales.codebook), 3, axis=1),
+                colours=np.repeat(_as_column(meta.sh0.codebook), 3, axis=1),
+                opacities=(np.arange(256) / 255.0).astype(np.float32),
+                sh=None if meta.shN is None else _as_column(meta.shN.codebook)[:, 0],
+            )
         fractions = np.arange(256)[:, None] / 255.0
         scales = _in_range(fractions, meta.scales.mins, meta.scales.maxs)
         colours = _in_range(fractions, meta.sh0.mins, meta.sh0.maxs)
@@ -167,10 +169,9 @@ def code_numbers(meta: SogMeta | SogMetaVersion1) -> CodeNumbers:
         return CodeNumbers(scales, colours[:, :3], logits.sigmoid().float().numpy(), sh)
 
 
-def _codebooks(meta: SogMeta) -> list[list[float]]:
-    """Return the codebooks of version 2."""
-    palette = [] if meta.shN is None else [meta.shN.codebook]
-    return [meta.scales.codebook, meta.sh0.codebook, *palette]
+def _as_column(codebook: list[float]) -> np.ndarray:
+    """Return a codebook as float32 [256, 1]."""
+    return np.array(codebook).astype(np.float32)[:, None]
 
 
 def _in_range(fractions: np.ndarray, mins: list[float], maxs: list[float]) -> np.ndarray:
