@@ -61,7 +61,7 @@ class _Section(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """What all sections share."""
+    """Facts that hold for all sections."""
 
     level: int  # of compression
     least_sh: float  # coefficient of the byte 0

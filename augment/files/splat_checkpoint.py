@@ -124,8 +124,10 @@ def _gsplat_columns(splats: Mapping[str, Any], where: str) -> tuple[dict[str, Te
     num_rows = len(columns["means"])
     if "shN" not in splats:
         return columns, columns["sh0"]
-    rest = checked_tensor(splats, "shN", (num_rows, None, 3), where, dtype=None, error=SceneError)
-    return columns, torch.cat([columns["sh0"].float(), rest.float()], dim=1)
+    higher_terms = checked_tensor(
+        splats, "shN", (num_rows, None, 3), where, dtype=None, error=SceneError
+    )
+    return columns, torch.cat([columns["sh0"].float(), higher_terms.float()], dim=1)
 
 
 def _grut_columns(content: Mapping[str, Any], where: str) -> tuple[dict[str, Tensor], Tensor]:
@@ -142,15 +144,15 @@ def _grut_columns(content: Mapping[str, Any], where: str) -> tuple[dict[str, Ten
     first = columns["albedo"].float()[:, None]
     if "features_specular" not in content:
         return columns, first
-    rest = checked_tensor(
+    higher_terms = checked_tensor(
         content, "features_specular", (num_rows, None), where, dtype=None, error=SceneError
     )
-    if rest.shape[1] % 3:
+    if higher_terms.shape[1] % 3:
         raise SceneError(
-            f"{where}: features_specular must have three channels a term; got {rest.shape[1]} "
+            f"{where}: features_specular must have three channels a term; got {higher_terms.shape[1]} "
             "columns"
         )
-    sh = torch.cat([first, rest.float().reshape(num_rows, -1, 3)], dim=1)
+    sh = torch.cat([first, higher_terms.float().reshape(num_rows, -1, 3)], dim=1)
     degree = content.get("n_active_features")
     if type(degree) is int and 0 <= degree < len(NUM_SH_BY_DEGREE):
         sh = sh[:, : NUM_SH_BY_DEGREE[degree]]  # later ones were not drawn yet
