@@ -149,8 +149,8 @@ def _grut_columns(content: Mapping[str, Any], where: str) -> tuple[dict[str, Ten
     )
     if higher_terms.shape[1] % 3:
         raise SceneError(
-            f"{where}: features_specular must have three channels a term; got {higher_terms.shape[1]} "
-            "columns"
+            f"{where}: features_specular must have three channels a term; got "
+            f"{higher_terms.shape[1]} columns"
         )
     sh = torch.cat([first, higher_terms.float().reshape(num_rows, -1, 3)], dim=1)
     degree = content.get("n_active_features")
