@@ -99,7 +99,8 @@ def _splat_content(path: str) -> Iterable[Path]:
 GAUSSIANS = Dataset(
     scheme="gaussians",
     description=(
-        "a `.ply`, `.splat`, `.spz`, `.sog`, `.glb` or `.usd`, or a trained 3DGS model's folder"
+        "a `.ply`, `.splat`, `.ksplat`, `.spz`, `.sog`, `.glb` or `.usd`, or a trained 3DGS "
+        "model's folder"
     ),
     page="splat-files.md",
     example="gaussians:model/point_cloud.ply?up=-y",

@@ -22,6 +22,7 @@ from augment.scene.cameras import Camera, Frame
 from augment.scene.ground import describe_ground, ground_of
 from augment.scene.scene import Gaussians, Scene
 from augment.scene.semantics import SemanticClass
+from tools.inspect_splats import describe_splat_files
 from tools.output import fill, write_json
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ def inspect_scene(options: InspectOptions) -> int:
         if options.camera_path is not None:
             scene = with_camera_path(scene, options.camera_path)
         facts = describe_scene(scene)
+        facts |= describe_splat_files(options.uri, scene)
     except IncompleteDrive as error:
         facts = describe_drive(error)
         print(drive_text(facts))

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from augment.errors import AdapterError, ClimateGSError
-from augment.files.pickles import ARRAY_NAMES, Name, Pickle, PickleError
+from augment.files.pickles import ARRAY_NAMES, Name, Pickle, PickleError, Record
 from recipes.files import open_file
 
 _COPY_CHUNK = 1 << 18  # numbers that are copied at a time: a megabyte of float32
@@ -33,8 +33,12 @@ _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C  # first value of a file of torch before 
 _LEGACY_PROTOCOL = 1001  # second value of such a file
 
 
-def load_checkpoint(path: Path) -> dict[str, Any]:
+def load_checkpoint(path: Path, *, has_settings: bool = False) -> dict[str, Any]:
     """Load the dictionary of a checkpoint; its tensors are mapped into the processor's memory.
+
+    Args:
+        path: the file.
+        has_settings: if True, OmegaConf's settings are accepted, and become `SettingsRecord`s.
 
     Raises:
         AdapterError: the file is missing, damaged, holds code or objects other than tensors and
@@ -43,7 +47,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise AdapterError(f"{path} does not exist; expected a checkpoint (.pth)")
     try:
-        content = read_torch(path)
+        content = read_torch(path, has_settings=has_settings)
     except PickleError as error:
         raise AdapterError(
             f"{path} was not read, and nothing in it was run: {error}. Only tensors and plain "
@@ -94,11 +98,15 @@ def read_state_dict(
     return {str(name): value for name, value in state_dict.items()}
 
 
-def read_torch(path: Path) -> Any:
+def read_torch(path: Path, *, has_settings: bool = False) -> Any:
     """Read a file that `torch.save` wrote, in its current format or that of before torch 1.6.
 
     Tensors are mapped from the file. Parameters become tensors, and ordered dictionaries become
     dictionaries.
+
+    Args:
+        path: the file.
+        has_settings: as in `load_checkpoint`; for the current format only.
 
     Raises:
         PickleError: the file holds something else than tensors and plain values, or is damaged.
@@ -109,14 +117,19 @@ def read_torch(path: Path) -> Any:
             if content[:4] != b"PK\3\4":
                 return _read_legacy(file, content)
             with zipfile.ZipFile(file) as archive:
-                return _read_zip(archive, content)
+                names = _NamesWithSettings(_NAMES) if has_settings else _NAMES
+                return _read_zip(archive, content, names)
     except PickleError:
         raise
     except Exception as error:  # zipfile raises half a dozen kinds for what is damaged
         raise PickleError(f"it is no whole checkpoint of torch ({error})") from None
 
 
-def _read_zip(archive: zipfile.ZipFile, content: mmap.mmap) -> Any:
+def _read_zip(
+    archive: zipfile.ZipFile,
+    content: mmap.mmap,
+    names: Mapping[tuple[str, str], Callable[..., Any]],
+) -> Any:
     entries = {entry.filename.partition("/")[2]: entry for entry in archive.infolist()}
     if "data.pkl" not in entries or len(entries) != len(archive.infolist()):
         raise PickleError("it is no whole checkpoint of torch (no data.pkl, or several)")
@@ -126,7 +139,7 @@ def _read_zip(archive: zipfile.ZipFile, content: mmap.mmap) -> Any:
     storages = _Storages(content, partial(_locate_in_zip, content, entries))
     with archive.open(entries["data.pkl"]) as opened:
         file: Any = opened  # a BufferedIOBase
-        return Pickle(file, _NAMES, storage=storages).value()
+        return Pickle(file, names, storage=storages).value()
 
 
 def _locate_in_zip(
@@ -280,6 +293,46 @@ def _names() -> dict[tuple[str, str], Callable[..., Any]]:
 
 
 _NAMES = _names()
+
+
+@dataclass(eq=False)
+class SettingsRecord(Record):
+    """An object of OmegaConf's, or a value inside of one, of which no code is run."""
+
+    state: Any = None  # the attributes of the object
+
+    def build(self, state: Any) -> None:
+        """Keep the attributes."""
+        self.state = state
+
+    def setting(self, *names: str) -> Any:
+        """Return the value under these names; None if there is none."""
+        node: Any = self
+        for name in names:
+            state = node.state if isinstance(node, SettingsRecord) else None
+            content = state.get("_content") if isinstance(state, dict) else None
+            node = content.get(name) if isinstance(content, dict) else None
+        state = node.state if isinstance(node, SettingsRecord) else None
+        return state.get("_val") if isinstance(state, dict) else None
+
+
+class _NamesWithSettings(dict[tuple[str, str], Callable[..., Any]]):
+    """The names of a checkpoint, and those of OmegaConf's settings in it."""
+
+    def __contains__(self, key: object) -> bool:
+        """Return True for a name that is replaced."""
+        if super().__contains__(key) or key == ("collections", "defaultdict"):
+            return True
+        module, name = key if isinstance(key, tuple) else ("", "")
+        if module in ("builtins", "__builtin__"):
+            return name in ("dict", "list", "tuple", "str", "unicode", "int", "float", "bool")
+        return str(module).partition(".")[0] in ("omegaconf", "typing", "pathlib")
+
+    def __missing__(self, key: tuple[str, str]) -> Callable[..., Any]:
+        """Return the replacement of a name of the settings."""
+        if key == ("collections", "defaultdict"):
+            return lambda *_: {}
+        return lambda *_: SettingsRecord()
 
 
 def dictionary_in(content: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:

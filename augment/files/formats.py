@@ -26,15 +26,21 @@ _ZIP = b"PK\x03\x04"  # first bytes of a zip, which several formats are
 @functools.cache
 def splat_formats() -> tuple[SplatFormat, ...]:
     """Return all splat formats, in the order in which messages name them."""
+    from augment.files.compressed_ply import COMPRESSED_PLY
     from augment.files.gltf import GLB, GLTF
+    from augment.files.ksplat import KSPLAT
     from augment.files.ply import PLY
     from augment.files.sog import SOG
     from augment.files.splat import SPLAT
+    from augment.files.splat_checkpoint import CHECKPOINT
     from augment.files.spz import SPZ
     from augment.files.streamed_sog import STREAMED_SOG
     from augment.files.usd import USD
 
-    return (PLY, SPLAT, SPZ, SOG, GLB, GLTF, USD, STREAMED_SOG)
+    return (
+        *(COMPRESSED_PLY, PLY, SPLAT, KSPLAT, SPZ, CHECKPOINT, SOG, GLB, GLTF, USD),
+        STREAMED_SOG,
+    )
 
 
 def splat_suffixes() -> tuple[str, ...]:
@@ -64,8 +70,9 @@ def read_splats(
 ) -> SplatFile:
     """Read a splat file of any format that is supported.
 
-    Formats are recognised by the first bytes (.ply, .spz, .sog, .glb), the name (.splat, .gltf,
-    .usd), the meta.json of a SOG folder, or the lod-meta.json of a streamed one.
+    Formats are recognised by the first bytes (.ply, .spz, .sog, .glb, checkpoints), the name
+    (.splat, .ksplat, .gltf, .usd), the meta.json of a SOG folder, or the lod-meta.json of a
+    streamed one.
 
     Args:
         path: the file.
@@ -78,7 +85,7 @@ def read_splats(
     """
     path = Path(path)
     try:
-        splat_format = _format_of(path)
+        splat_format = find_format(path)
         options = {"level": level, "activated": activated}
         stated_options = {name: value for name, value in options.items() if value is not None}
         for name in stated_options:
@@ -102,7 +109,7 @@ _OPTION_ERRORS = {
 }
 
 
-def _format_of(path: Path) -> SplatFormat | None:
+def find_format(path: Path) -> SplatFormat | None:
     """Return the format of a file; None if neither its first bytes nor its name tell."""
     if not path.is_file():
         raise SceneError(f"{path}: no such file; expected a {splat_names()}")
@@ -111,7 +118,8 @@ def _format_of(path: Path) -> SplatFormat | None:
     by_name = next((f for f in splat_formats() if f.fits_name(path)), None)
     if by_name is not None and start.startswith(_ZIP):
         return by_name  # a .usdz is a zip, and so is a .sog
-    return next((f for f in splat_formats() if start.startswith(f.first_bytes)), by_name)
+    by_bytes = (f for f in splat_formats() if start.startswith(f.first_bytes))
+    return next((f for f in by_bytes if f.fits_content(path)), by_name)
 
 
 def _unknown_format(path: Path) -> str:
@@ -121,5 +129,5 @@ def _unknown_format(path: Path) -> str:
     by_suffix = join_names(f.name for f in formats if not f.first_bytes)
     return (
         f"{path}: neither a {by_bytes}, which its first bytes would tell, nor named {by_suffix}; "
-        "convert other splat formats (.ksplat) to .ply first, for example with SuperSplat"
+        "convert other splat formats (.lcc) to .ply first, for example with splat-transform"
     )

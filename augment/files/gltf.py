@@ -4,8 +4,9 @@ A primitive of points has POSITION, and after the extension's name and a colon R
 SCALE (linear), OPACITY and SH_DEGREE_l_COEF_n. Nodes place its mesh in the scene, y up, metres.
 Sources: the glTF 2.0 specification and the extension's README (KhronosGroup/glTF) as ratified.
 Until 2026 its drafts stored logarithms of scales. The ratified extension forbids negative scales:
-where a scale is negative, all are read as logarithms, and a problem is reported. Compressed splats
-(SPZ, meshopt) and linear colours are refused.
+where a scale is negative, all are read as logarithms, and a problem is reported. Splats may be a
+.spz in a buffer view (the drafts KHR_gaussian_splatting_compression_spz and _spz_2), whose axes are
+then those of the node. Other compression (meshopt) and linear colours are refused.
 
 A file is not trusted: counts are compared with the bytes that exist, placed copies with the file's
 size, and buffers must lie in the file, in its text, or beside it.
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import io
 import json
 import struct
 from collections.abc import Iterator, Sequence
@@ -37,6 +39,7 @@ from pydantic import (
 from augment.errors import SceneError
 from augment.files.limits import check_memory, parse_json_object
 from augment.files.splat_format import (
+    FileFacts,
     Loss,
     SplatFile,
     SplatFormat,
@@ -44,6 +47,8 @@ from augment.files.splat_format import (
     join_positioned_parts,
     rotate_z_to_y,
 )
+from augment.files.spz import UP as SPZ_UP
+from augment.files.spz import read_spz_stream
 from augment.output.atomic import write_file_atomically
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians
@@ -63,7 +68,9 @@ _MAX_VALUES = 2_000_000  # values in the JSON, without buffers
 _MAX_NODES = 20_000  # nodes of a file
 _MAX_ATTRIBUTES = 1000  # attributes of a primitive
 _MAX_PRIMITIVES = 10_000  # primitives in the scene, copies included
-_READ_EXTENSIONS = {EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit"}
+# Names of the extension that stores a .spz in place of the columns.
+_SPZ_EXTENSIONS = tuple(f"{EXTENSION}_compression_{name}" for name in ("spz_2", "spz"))
+_READ_EXTENSIONS = {*_SPZ_EXTENSIONS, EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit"}
 # Accepted colour spaces: none stated, the ratified name, and two names of the drafts.
 _COLOUR_SPACES = (None, "srgb_rec709_display", "BT.709-sRGB", "BT.709")
 # numpy's type codes of glTF's component types.
@@ -117,6 +124,17 @@ class _Splatting(_Entry):
     kernel: str | None = None
     colorSpace: str | None = None
     extensions: dict[str, Any] = {}
+
+    @property
+    def spz_view(self) -> int | None:
+        """Return the buffer view of a .spz; None where the attributes hold the splats."""
+        entry = next(
+            (self.extensions.get(n) for n in _SPZ_EXTENSIONS if n in self.extensions), None
+        )
+        if entry is None or len(self.extensions) > 1:
+            return None
+        number = entry.get("bufferView") if isinstance(entry, dict) else None
+        return number if type(number) is int and number >= 0 else None
 
 
 class _PrimitiveExtensions(_Entry):
@@ -254,6 +272,8 @@ class _File:
         primitives = list(self.placed_primitives())
         if not primitives:
             raise self.error(f"its scene has no primitive with {EXTENSION}; splats are needed")
+        for primitive, _ in primitives:
+            self.check_extension(primitive)
         self.check_rows([primitive for primitive, _ in primitives])
         columns_by_primitive: dict[int, _Columns] = {}
         parts = []
@@ -274,6 +294,9 @@ class _File:
         accessors = [document.accessors[p.attributes.get("POSITION", 0)] for p in primitives]
         num_gaussians = sum(accessor.count for accessor in accessors)
         views = {a.bufferView for a in accessors if a.bufferView is not None}
+        numbers = [_spz_view(primitive) for primitive in primitives]
+        spz_views = {number for number in numbers if number is not None}
+        views |= spz_views
         buffer_numbers = {document.bufferViews[view].buffer for view in views}
         sizes = {
             document.buffers[n].uri: len(self.buffer(n)) for n in buffer_numbers
@@ -285,6 +308,7 @@ class _File:
                 f"{max_gaussians} that its buffers have room for; place fewer copies"
             )
         num_sh = max(sum(_SH_INFIX in name for name in p.attributes) for p in primitives)
+        num_sh = NUM_SH_BY_DEGREE[-1] if spz_views else num_sh
         check_memory(str(self.path), num_gaussians, num_sh=num_sh, file_bytes=sum(sizes.values()))
 
     def placed_primitives(self) -> Iterator[tuple[_Primitive, np.ndarray]]:
@@ -338,17 +362,23 @@ class _File:
                 f"{self.path}: left out {num_other} meshes and points, not Gaussians"
             )
 
-    def columns(self, primitive: _Primitive) -> _Columns:
-        """Read the columns of one primitive."""
+    def check_extension(self, primitive: _Primitive) -> None:
+        """Refuse splats of other kernels, colours and compressions, by their names."""
         extension = primitive.extensions.KHR_gaussian_splatting
         assert extension is not None
-        if extension.extensions:
+        if extension.extensions and extension.spz_view is None:
             raise self.error(f"{', '.join(extension.extensions)} is not read; export without")
         if extension.kernel not in (None, "ellipse") or extension.colorSpace not in _COLOUR_SPACES:
             raise self.error(
                 f"expected the kernel ellipse and colours in srgb_rec709_display; it has "
                 f"{extension.kernel} and {extension.colorSpace}"
             )
+
+    def columns(self, primitive: _Primitive) -> _Columns:
+        """Read the columns of one primitive."""
+        spz_view = _spz_view(primitive)
+        if spz_view is not None:
+            return self.spz_columns(primitive, spz_view)
         accessors = {
             name.removeprefix(f"{EXTENSION}:"): accessor
             for name, accessor in primitive.attributes.items()
@@ -393,6 +423,34 @@ class _File:
             opacities=column("OPACITY", "SCALAR")[:, 0],
             sh=np.stack([column(name, "VEC3") for name in names], axis=1),
             is_log=is_log,
+        )
+
+    def spz_columns(self, primitive: _Primitive, view_number: int) -> _Columns:
+        """Read the columns of one primitive from a .spz in a buffer view."""
+        view = self.document.bufferViews[view_number]
+        data = self.buffer(view.buffer)
+        end = view.byteOffset + view.byteLength
+        if end > len(data):
+            raise self.error(
+                f"a .spz takes bytes {view.byteOffset} to {end} of a buffer with {len(data)}: "
+                "truncated or damaged"
+            )
+        packed = data[view.byteOffset : end].tobytes()
+        content = read_spz_stream(io.BytesIO(packed), len(packed), f"{self.path}: its .spz")
+        gaussians = content.gaussians
+        count = self.document.accessors[primitive.attributes.get("POSITION", 0)].count
+        if len(gaussians) != count:
+            raise self.error(f"its .spz holds {len(gaussians)} Gaussians; POSITION says {count}")
+        if content.up != SPZ_UP:
+            raise self.error(f"its .spz says that {content.up} is up; {SPZ_UP} is in glTF")
+        self.problems += content.problems
+        return _Columns(
+            means=gaussians.means.numpy(),
+            quats=gaussians.quats.numpy(),
+            scales=gaussians.scales.numpy(),
+            opacities=gaussians.opacities.numpy(),
+            sh=gaussians.sh.numpy(),
+            is_log=False,
         )
 
     def column(self, name: str, number: int, kind: str, count: int) -> np.ndarray:
@@ -456,6 +514,12 @@ class _File:
         if not file.is_file() or not file.stat().st_size:
             raise self.error(f"its buffer {uri[:200]!r} is not there; copy it beside the file")
         return np.memmap(file, np.uint8, "r")
+
+
+def _spz_view(primitive: _Primitive) -> int | None:
+    """Return the buffer view of a primitive's .spz; None if it has none."""
+    extension = primitive.extensions.KHR_gaussian_splatting
+    return None if extension is None else extension.spz_view
 
 
 def _sh_name(degree: int, number: int) -> str:
@@ -569,9 +633,35 @@ def write_glb(path: str | Path, gaussians: Gaussians) -> None:
             file.write(array.tobytes())
 
 
+def describe_gltf(path: Path) -> FileFacts:
+    """Return the facts of a glTF file's JSON."""
+    document = _File(path).document
+    generator = document.asset.get("generator", "")
+    names = {
+        name
+        for mesh in document.meshes
+        for primitive in mesh.primitives
+        if primitive.extensions.KHR_gaussian_splatting is not None
+        for name in primitive.extensions.KHR_gaussian_splatting.extensions
+    }
+    warnings = []
+    if names:
+        warnings.append(
+            f"splats are stored by {', '.join(sorted(names))}, a draft: viewers of the ratified "
+            f"{EXTENSION} show nothing"
+        )
+    return FileFacts(
+        version=f"glTF {document.asset.get('version')}",
+        writer=generator[:80] if isinstance(generator, str) else "",
+        **NOTES,
+        warnings=tuple(warnings),
+    )
+
+
 _AXES = "its unit is the metre, y points up in it; cameras are left out"
 GLB = SplatFormat(
     name=".glb",
+    describe=describe_gltf,
     reader=read_gltf,
     suffixes=(".glb",),
     first_bytes=(_GLB_MARK,),
@@ -588,4 +678,4 @@ GLB = SplatFormat(
         ),
     ),
 )
-GLTF = SplatFormat(name=".gltf", reader=read_gltf, suffixes=(".gltf",))
+GLTF = SplatFormat(name=".gltf", reader=read_gltf, suffixes=(".gltf",), describe=describe_gltf)

@@ -18,7 +18,14 @@ import torch
 from torch import Tensor
 
 from augment.errors import SceneError
-from augment.files.splat_format import SplatFile, SplatFormat, SplatWriter, recentring_origin
+from augment.files.splat_format import (
+    FileFacts,
+    SplatFile,
+    SplatFormat,
+    SplatWriter,
+    recentring_origin,
+    writer_in,
+)
 from augment.output.atomic import write_file_atomically
 from augment.render.sh import SH_C0
 from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
@@ -86,6 +93,12 @@ class PlyHeader:
                 return element
         names = ", ".join(repr(e.name) for e in self.elements) or "none"
         raise SceneError(f"{self.path}: expected an element {name!r} in the .ply; found {names}")
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """Return the comments of the form `key: value`."""
+        pairs = (comment.partition(":") for comment in self.comments)
+        return {key.strip(): value.strip() for key, colon, value in pairs if colon}
 
     def row_dtype(self, element: PlyElement) -> np.dtype:
         """Return the type of the rows that `iterate_rows` yields."""
@@ -384,8 +397,6 @@ def _has_wide_means(header: PlyHeader, table: PlyElement) -> bool:
 
 def _guess_content(header: PlyHeader, names: set[str]) -> str:
     """Return a sentence about a .ply without the columns of Gaussians."""
-    if "packed_position" in names:
-        return "This is SuperSplat's compressed layout: export it as uncompressed .ply."
     if any(e.name in ("face", "tristrips") for e in header.elements):
         return "This is a mesh; a trained 3D Gaussian splat is needed."
     if "scale_0" in names and "scale_2" not in names:
@@ -451,9 +462,7 @@ def read_ply(
         semantic=None if semantic is None else torch.from_numpy(semantic),
     )
     gaussians, problems = check_gaussians(gaussians, where=str(header.path))
-    pairs = (comment.partition(":") for comment in header.comments)
-    notes = {key.strip(): value.strip() for key, colon, value in pairs if colon}
-    return SplatFile(gaussians, origin, notes, (*problems, *header.surplus_problems()))
+    return SplatFile(gaussians, origin, header.notes, (*problems, *header.surplus_problems()))
 
 
 def _looks_activated(scales: Tensor, opacities: Tensor) -> bool:
@@ -509,8 +518,36 @@ def _file_columns(part: Gaussians) -> dict[str, np.ndarray]:
     return _columns_of({name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()})
 
 
+def describe_ply_header(path: Path) -> FileFacts:
+    """Return the facts of a .ply's header."""
+    header = read_ply_header(path)
+    orders = {"<": "binary, little endian", ">": "binary, big endian", "ascii": "text"}
+    warnings = []
+    table = next((e for e in header.elements if e.name == "vertex"), PlyElement("", 0))
+    wide_axes = [axis for axis in "xyz" if table.columns.get(axis) == "f8"]
+    if wide_axes:
+        warnings.append(
+            f"{', '.join(wide_axes)} are doubles: most viewers read floats only, and take the "
+            "columns behind them for others"
+        )
+    if "red" in table.columns and "f_dc_0" not in table.columns:
+        warnings.append("colours are red, green, blue: viewers that look for f_dc show it grey")
+    if header.byte_order != "<":
+        warnings.append("most viewers read little-endian binary files only")
+    notes = header.notes
+    return FileFacts(
+        version=orders[header.byte_order],
+        writer=writer_in(header.comments),
+        up=notes.get("up", ""),
+        unit=notes.get("unit", ""),
+        warnings=tuple(warnings),
+    )
+
+
 PLY = SplatFormat(
     name=".ply",
+    describe=describe_ply_header,
+    viewer_up="-y",
     reader=read_ply,
     suffixes=(".ply",),
     first_bytes=(b"ply\n", b"ply\r"),

@@ -1,15 +1,17 @@
-"""Reads and writes Gaussians in SOG files of version 2 (PlayCanvas).
+"""Reads Gaussians in SOG files of versions 1 and 2 (PlayCanvas), and writes version 2.
 
 A SOG is meta.json and lossless images, in a folder or zipped as .sog. A pixel of each image is a
 Gaussian: 16 bits of each coordinate's signed logarithm, rotations by their three smaller
 components, logarithms of scales and colours by codebooks of 256 numbers, opacities, and bands of
 spherical harmonics as entries of one palette.
 
+Version 1 has no number. It has ranges instead of codebooks, and stores logits of opacities.
+
 Sources: developer.playcanvas.com, "The SOG Format", and github.com/playcanvas/splat-transform,
-src/lib/readers/read-sog.ts (MIT). Where the two differ, the code counts: scales are logarithms, the
-first component of a rotation is w, and the axes are those of the .ply that the SOG was made from.
-So meta.json of the files written here says which axis is up and what a unit is, in a field
-"climategs" that other readers ignore.
+src/lib/readers/read-sog.ts and read-sog-v1.ts (MIT). Where the two differ, the code counts: scales
+are logarithms, the first component of a rotation is w, and the axes are those of the .ply that the
+SOG was made from. So meta.json of the files written here says which axis is up and what a unit is,
+in a field "climategs" that other readers ignore.
 """
 
 from __future__ import annotations
@@ -22,17 +24,28 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from augment.errors import SceneError
 from augment.files.image_size import image_header
 from augment.files.limits import check_memory, parse_json_object, row_slices, validate_model
+from augment.files.sog_meta import (
+    CODEBOOK_SIZE,
+    MAX_PALETTE,
+    NUM_SH_REST,
+    Palette,
+    RangedPalette,
+    SogMeta,
+    SogMetaVersion1,
+    code_numbers,
+)
 from augment.files.splat_format import (
+    ANTIALIASED_WARNING,
+    FileFacts,
     Loss,
     SplatFile,
     SplatFormat,
@@ -48,89 +61,14 @@ from recipes.files import open_file
 SUFFIX = ".sog"  # the end of the zipped files' names
 META = "meta.json"  # the name of the file that describes the others
 _ZIP = b"PK\x03\x04"  # first bytes of a zip
-_CODEBOOK_SIZE = 256  # numbers of a codebook
 _MAX_CODE = 65535  # the largest code of a coordinate
-_NUM_SH_REST = (0, 3, 8, 15)  # coefficients a channel beyond the first, by bands
 _ENTRIES_PER_ROW = 64  # entries of the palette in a row of its image
-MAX_PALETTE = 1 << 16  # entries of a palette
 _MAX_META_BYTES = 1 << 20  # bytes of meta.json
 # Pixels that an image may have beyond twice the number of Gaussians.
 _MAX_UNUSED_PIXELS = 1 << 16
 
 _READ_ERRORS = (OSError, EOFError, RuntimeError, ValueError, struct.error, zipfile.BadZipFile)
 _READ_ERRORS += (zlib.error, lzma.LZMAError)
-
-# ---- meta.json -----------------------------------------------------------------------------------
-
-
-class _Part(BaseModel):
-    """Base of meta.json's objects."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False, strict=True)
-
-
-def _patch_codebook(codebook: object) -> object:
-    """Replace a null in the first place of a codebook, as PlayCanvas does; early files have it."""
-    if isinstance(codebook, list) and codebook[:1] == [None] and len(codebook) == _CODEBOOK_SIZE:
-        second = codebook[1]
-        last = codebook[-1]
-        if isinstance(second, int | float) and isinstance(last, int | float):
-            return [second + (second - last) / (_CODEBOOK_SIZE - 1), *codebook[1:]]
-    return codebook
-
-
-Codebook = Annotated[
-    list[float],
-    BeforeValidator(_patch_codebook),
-    Field(min_length=_CODEBOOK_SIZE, max_length=_CODEBOOK_SIZE),
-]
-Three = Annotated[list[float], Field(min_length=3, max_length=3)]
-OneFile = Annotated[list[str], Field(min_length=1, max_length=1)]
-TwoFiles = Annotated[list[str], Field(min_length=2, max_length=2)]
-
-
-class _Means(_Part):
-    """Ranges and files of the positions."""
-
-    mins: Three  # smallest signed logarithm of each coordinate
-    maxs: Three  # largest
-    files: TwoFiles  # images of the low and the high bytes
-
-
-class _Coded(_Part):
-    """Numbers stored by a codebook."""
-
-    codebook: Codebook
-    files: OneFile
-
-
-class _Quats(_Part):
-    """The file of the rotations."""
-
-    files: OneFile
-
-
-class _Palette(_Part):
-    """Spherical harmonics stored by a palette."""
-
-    count: int = Field(ge=1, le=MAX_PALETTE)  # entries
-    bands: int = Field(ge=1, le=3)  # bands of spherical harmonics beyond the first
-    codebook: Codebook
-    files: TwoFiles  # images of the entries and of each Gaussian's entry
-
-
-class _Meta(_Part):
-    """The content of meta.json."""
-
-    version: Literal[2]
-    count: int = Field(ge=1)
-    means: _Means
-    scales: _Coded
-    quats: _Quats
-    sh0: _Coded
-    shN: _Palette | None = None
-    climategs: dict[str, str] = {}
-
 
 # ---- Reading -------------------------------------------------------------------------------------
 
@@ -248,7 +186,7 @@ def _read(files: _Files) -> tuple[Gaussians, dict[str, str]]:
     """Read and decode all images."""
     meta = _read_meta(files)
     count = meta.count
-    max_bytes = max(2 * meta.count, _MAX_META_BYTES) * 4
+    max_bytes = max(2 * count, _MAX_META_BYTES) * 4
     low_bytes, high_bytes = (
         _pixels_of_gaussians(files.pixels(name, max_bytes, count), count)
         for name in meta.means.files
@@ -256,18 +194,23 @@ def _read(files: _Files) -> tuple[Gaussians, dict[str, str]]:
     colour_codes = _pixels_of_gaussians(files.pixels(meta.sh0.files[0], max_bytes, count), count)
     scale_codes = _pixels_of_gaussians(files.pixels(meta.scales.files[0], max_bytes, count), count)
     quat_codes = _pixels_of_gaussians(files.pixels(meta.quats.files[0], max_bytes, count), count)
-    palette = None if meta.shN is None else _palette_entries(files, meta.shN, count, max_bytes)
-    bands = 0 if meta.shN is None else meta.shN.bands
+    palette = None
+    if meta.shN is not None:
+        shape = _palette_shape(files, meta.shN)
+        palette = _palette_entries(files, meta.shN.files, shape, count, max_bytes)
+    num_rest = 0 if palette is None else palette.entries.shape[1]
     gaussians = Gaussians(
         means=torch.empty(count, 3),
         quats=torch.empty(count, 4),
         scales=torch.empty(count, 3),
         opacities=torch.empty(count),
-        sh=torch.empty(count, 1 + _NUM_SH_REST[bands], 3),
+        sh=torch.empty(count, 1 + num_rest, 3),
     )
     arrays = {name: getattr(gaussians, name).numpy() for name in ("means", "quats", "scales", "sh")}
     mins = np.array(meta.means.mins)
     maxs = np.array(meta.means.maxs)
+    numbers = code_numbers(meta)
+    channels = np.arange(3)
     for rows in row_slices(count):
         codes = low_bytes[rows, :3] | high_bytes[rows, :3].astype(np.uint16) << 8
         with np.errstate(
@@ -275,47 +218,45 @@ def _read(files: _Files) -> tuple[Gaussians, dict[str, str]]:
         ):  # infinite values are left out later, and reported
             logs = mins + (maxs - mins) * (codes / _MAX_CODE)
             arrays["means"][rows] = np.copysign(np.expm1(np.abs(logs)), logs)
-            arrays["scales"][rows] = np.exp(_look_up(meta.scales.codebook, scale_codes[rows, :3]))
+            arrays["scales"][rows] = np.exp(numbers.scales[scale_codes[rows, :3], channels])
         arrays["quats"][rows] = _decode_quats(quat_codes[rows])
-        arrays["sh"][rows, 0] = _look_up(meta.sh0.codebook, colour_codes[rows, :3])
-        if palette is not None and meta.shN is not None:
+        arrays["sh"][rows, 0] = numbers.colours[colour_codes[rows, :3], channels]
+        if palette is not None and numbers.sh is not None:
             sh_codes = palette.entries[palette.labels[rows]]
-            arrays["sh"][rows, 1:] = _look_up(meta.shN.codebook, sh_codes)
-        gaussians.opacities.numpy()[rows] = colour_codes[rows, 3] / 255.0
-    return gaussians, {key: meta.climategs[key] for key in ("up", "unit") if key in meta.climategs}
+            arrays["sh"][rows, 1:] = numbers.sh[sh_codes]
+        gaussians.opacities.numpy()[rows] = numbers.opacities[colour_codes[rows, 3]]
+    stated_notes = {} if isinstance(meta, SogMetaVersion1) else meta.climategs
+    return gaussians, {key: stated_notes[key] for key in ("up", "unit") if key in stated_notes}
 
 
-def _read_meta(files: _Files) -> _Meta:
+def _read_meta(files: _Files) -> SogMeta | SogMetaVersion1:
     """Read and check meta.json."""
     where = str(files.path) if files.zip is None else f"{files.path}: {META}"
     content = parse_json_object(files.read(META, _MAX_META_BYTES), where)
     if "means" not in content:
         raise SceneError(f"{where} does not describe splats: it has no 'means'")
-    if content.get("version") != 2:
+    if content.get("version", 1) not in (1, 2):
         raise SceneError(
-            f"{where}: only version 2 of SOG is read; got {content.get('version')!r:.20}. Save it "
-            f"anew with SplatTransform or SuperSplat, or as .ply"
+            f"{where}: only versions 1 and 2 of SOG are read; got {content['version']!r:.20}. Save "
+            f"it anew with SplatTransform or SuperSplat, or as .ply"
         )
-    meta = validate_model(_Meta, content, where)
+    is_version_2 = content.get("version", 1) == 2
+    meta = validate_model(SogMeta if is_version_2 else SogMetaVersion1, content, where)
     names = [*meta.means.files, *meta.scales.files, *meta.quats.files, *meta.sh0.files]
     names += [] if meta.shN is None else meta.shN.files
     size = files.path.stat().st_size
     if files.zip is None:
         size = sum((files.path.parent / Path(name).name).stat().st_size for name in {*names})
-    bands = 0 if meta.shN is None else meta.shN.bands
-    check_memory(where, meta.count, num_sh=1 + _NUM_SH_REST[bands], file_bytes=size)
+    bands = 0 if meta.shN is None else len(NUM_SH_REST) - 1
+    if isinstance(meta.shN, Palette):
+        bands = meta.shN.bands
+    check_memory(where, meta.count, num_sh=1 + NUM_SH_REST[bands], file_bytes=size)
     return meta
 
 
 def _pixels_of_gaussians(pixels: np.ndarray, count: int) -> np.ndarray:
     """Return the pixels of the Gaussians, [N, 4]."""
     return pixels.reshape(-1, 4)[:count]
-
-
-def _look_up(codebook: list[float], indices: np.ndarray) -> np.ndarray:
-    """Look up codes in a codebook, float32."""
-    with np.errstate(over="ignore"):
-        return np.array(codebook).astype(np.float32)[indices]
 
 
 def _decode_quats(pixels: np.ndarray) -> np.ndarray:
@@ -345,30 +286,62 @@ class _PaletteEntries(NamedTuple):
     labels: np.ndarray  # int64 [N], the entry of each Gaussian
 
 
+class _PaletteShape(NamedTuple):
+    """The size of a palette of spherical harmonics."""
+
+    num_entries: int
+    bands: int  # bands of spherical harmonics beyond the first
+
+
+def _palette_shape(files: _Files, palette: Palette | RangedPalette) -> _PaletteShape:
+    """Return the size of a palette, which version 1 tells by the size of its image."""
+    if isinstance(palette, Palette):
+        return _PaletteShape(palette.count, palette.bands)
+    name = palette.files[0]
+    widths = [_ENTRIES_PER_ROW * num_rest for num_rest in NUM_SH_REST]
+    max_height = MAX_PALETTE // _ENTRIES_PER_ROW
+    header = image_header(files.read(name, 4 * widths[-1] * max_height + _MAX_META_BYTES))
+    if header is None or header.width not in widths[1:] or not 1 <= header.height <= max_height:
+        size_text = "no image" if header is None else f"{header.width} x {header.height}"
+        raise SceneError(
+            f"{files.path}: {name} must be 192, 512 or 960 pixels wide for 1 to 3 bands, and at "
+            f"most {max_height} high; got {size_text}"
+        )
+    return _PaletteShape(_ENTRIES_PER_ROW * header.height, widths.index(header.width))
+
+
 def _palette_entries(
-    files: _Files, palette: _Palette, count: int, max_bytes: int
+    files: _Files, names: list[str], shape: _PaletteShape, count: int, max_bytes: int
 ) -> _PaletteEntries:
-    """Read the palette and each Gaussian's entry."""
-    row_width = _ENTRIES_PER_ROW * _NUM_SH_REST[palette.bands]
-    num_rows = -(-palette.count // _ENTRIES_PER_ROW)
+    """Read the palette and each Gaussian's entry.
+
+    Args:
+        files: the files of the SOG.
+        names: the images of the entries and of each Gaussian's entry.
+        shape: the size of the palette.
+        count: the number of Gaussians.
+        max_bytes: the largest size of an image of the Gaussians, bytes.
+    """
+    row_width = _ENTRIES_PER_ROW * NUM_SH_REST[shape.bands]
+    num_rows = -(-shape.num_entries // _ENTRIES_PER_ROW)
     entries = files.pixels(
-        palette.files[0],
+        names[0],
         4 * row_width * (num_rows + _ENTRIES_PER_ROW) + _MAX_META_BYTES,
         row_width * num_rows,
     )
     if entries.shape[1] != row_width:
         raise SceneError(
-            f"{files.path}: {palette.files[0]} must be {row_width} pixels wide for {palette.bands} "
-            f"bands; got {entries.shape[1]}"
+            f"{files.path}: {names[0]} must be {row_width} pixels wide for {shape.bands} bands; "
+            f"got {entries.shape[1]}"
         )
-    low_bytes, high_bytes = _pixels_of_gaussians(
-        files.pixels(palette.files[1], max_bytes, count), count
-    )[:, :2].T
+    low_bytes, high_bytes = _pixels_of_gaussians(files.pixels(names[1], max_bytes, count), count)[
+        :, :2
+    ].T
     labels = low_bytes | high_bytes.astype(np.int64) << 8
-    if labels.max() >= palette.count:
+    if labels.max() >= shape.num_entries:
         raise SceneError(
-            f"{files.path}: {palette.files[1]} names entry {labels.max()} of a palette of "
-            f"{palette.count}"
+            f"{files.path}: {names[1]} names entry {labels.max()} of a palette of "
+            f"{shape.num_entries}"
         )
     return _PaletteEntries(entries[..., :3].reshape(-1, row_width // _ENTRIES_PER_ROW, 3), labels)
 
@@ -492,11 +465,11 @@ def _encode_scalars(values: np.ndarray) -> tuple[list[float], np.ndarray]:
     """
     ordered = np.sort(values, axis=None).astype(np.float64)
     levels = np.unique(ordered)
-    if len(levels) > _CODEBOOK_SIZE:
-        counts, edges = np.histogram(ordered, _CODEBOOK_SIZE)
+    if len(levels) > CODEBOOK_SIZE:
+        counts, edges = np.histogram(ordered, CODEBOOK_SIZE)
         cumulative_density = np.concatenate([[0], np.cumsum(np.cbrt(counts))])
         levels = np.interp(
-            (np.arange(_CODEBOOK_SIZE) + 0.5) / _CODEBOOK_SIZE * cumulative_density[-1],
+            (np.arange(CODEBOOK_SIZE) + 0.5) / CODEBOOK_SIZE * cumulative_density[-1],
             cumulative_density,
             edges,
         )
@@ -510,7 +483,7 @@ def _encode_scalars(values: np.ndarray) -> tuple[list[float], np.ndarray]:
             )
     levels = np.array([float(f"{level:.9g}") for level in levels.astype(np.float32)])
     codes = np.searchsorted((levels[1:] + levels[:-1]) / 2, values).astype(np.uint8)
-    return np.pad(levels, (0, _CODEBOOK_SIZE - len(levels)), "edge").tolist(), codes
+    return np.pad(levels, (0, CODEBOOK_SIZE - len(levels)), "edge").tolist(), codes
 
 
 _NUM_GROUPS = 256  # groups of the first step
@@ -589,8 +562,26 @@ def _export(path: Path, gaussians: Gaussians, facts: Mapping[str, str]) -> None:
     write_sog(path, transform_gaussians_rigidly(gaussians, z_to_minus_y, zero), notes=notes)
 
 
+def describe_sog(path: Path) -> FileFacts:
+    """Return the facts of a SOG's meta.json."""
+    with contextlib.closing(_Files(path)) as files:
+        meta = _read_meta(files)
+    if isinstance(meta, SogMetaVersion1):
+        return FileFacts(version="version 1")
+    notes = meta.climategs
+    return FileFacts(
+        version="version 2",
+        writer=meta.asset.generator[:80] or ("ClimateGS" if notes else ""),
+        up=notes.get("up", ""),
+        unit=notes.get("unit", ""),
+        warnings=(ANTIALIASED_WARNING,) if meta.antialias else (),
+    )
+
+
 SOG = SplatFormat(
     name=".sog",
+    describe=describe_sog,
+    viewer_up="-y",
     reader=read_sog,
     suffixes=(SUFFIX,),
     first_bytes=(_ZIP,),

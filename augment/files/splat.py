@@ -85,6 +85,7 @@ def _export(path: Path, gaussians: Gaussians, _facts: Mapping[str, str]) -> None
 
 SPLAT = SplatFormat(
     name=".splat",
+    viewer_up="-y",
     reader=read_splat,
     suffixes=(".splat",),
     writer=SplatWriter(

@@ -5,7 +5,8 @@ Each format has its record in its own file. `augment.files.formats` lists them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -36,6 +37,30 @@ class SplatFile:
     problems: tuple[str, ...] = ()  # one sentence about each thing that was left out
 
 
+class FileFacts(NamedTuple):
+    """Facts of a splat file's header, as `climategs inspect` prints them; empty where not known."""
+
+    version: str = ""  # of the format, with its kind of packing
+    writer: str = ""  # the program that wrote the file
+    up: str = ""  # the axis that the file says points up
+    unit: str = ""  # the unit that the file states
+    warnings: tuple[str, ...] = ()  # things that other viewers show wrongly, one sentence each
+
+
+ANTIALIASED_WARNING = (
+    "trained for an antialiasing renderer (Mip-Splatting): viewers without its filter show far and "
+    "thin splats too thick and too opaque"
+)
+_WRITER = re.compile(r"(?:generated|created|written|made|exported) (?:by|with) (.+)", re.IGNORECASE)
+
+
+def writer_in(comments: Iterable[str]) -> str:
+    """Return the program that a comment names; empty if none does."""
+    matches = (_WRITER.search(comment) for comment in comments)
+    names = [match[1].strip() for match in matches if match is not None]
+    return names[0][:80] if names else ""
+
+
 class Loss(NamedTuple):
     """A thing of a scene that a format cannot keep."""
 
@@ -64,7 +89,8 @@ class SplatFormat:
     """A format of splat files.
 
     A file has the format if it begins with one of `first_bytes`, or is named as one of
-    `file_names`. If the format has no `first_bytes`, its suffixes tell.
+    `file_names`. If the format has no `first_bytes`, its suffixes tell. Formats that share their
+    first bytes are told apart by `fits_content`.
     """
 
     name: str  # for messages, such as ".spz"
@@ -72,6 +98,13 @@ class SplatFormat:
     suffixes: tuple[str, ...] = ()  # lower case; files with them are splat files of a folder
     first_bytes: tuple[bytes, ...] = ()
     file_names: tuple[str, ...] = ()
+    # Returns True if a file with these first bytes has this format.
+    fits_content: Callable[[Path], bool] = lambda path: True
+    # Returns facts of a file's header.
+    describe: Callable[[Path], FileFacts] = lambda path: FileFacts()
+    viewer_up: str = (
+        ""  # the axis that viewers of the format take for up; empty if the file says it
+    )
     option: str = ""  # the one option of `read_splats` that the reader takes
     writer: SplatWriter | None = None
 

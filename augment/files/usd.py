@@ -192,7 +192,12 @@ def _gaussians(columns: dict[str, np.ndarray], degree: int) -> Gaussians:
 
 
 def write_usd(path: str | Path, gaussians: Gaussians, *, is_upright: bool, is_metric: bool) -> None:
-    """Write a .usdc with one prim of floats, atomically.
+    """Write a .usdc with one prim of floats under a root, atomically.
+
+    It meets the rules that NVIDIA publishes for splats (SimReady's SPL.001 to SPL.006, and VG.035
+    of the Omniverse asset requirements), where up and unit are known: all arrays have the same
+    length, scales and opacities are linear, quaternions have length 1, there are (degree + 1)^2
+    coefficients a Gaussian, and the stage has a default prim, an up axis and metres a unit.
 
     Args:
         path: the file.
@@ -207,8 +212,9 @@ def write_usd(path: str | Path, gaussians: Gaussians, *, is_upright: bool, is_me
         pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.z)
     if is_metric:
         pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    field = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, "/Gaussians")
-    stage.SetDefaultPrim(field.GetPrim())
+    root = pxr.UsdGeom.Xform.Define(stage, "/Scene")
+    stage.SetDefaultPrim(root.GetPrim())
+    field = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, "/Scene/Gaussians")
 
     def numbers(tensor: torch.Tensor) -> np.ndarray:
         return np.ascontiguousarray(tensor.detach().cpu().numpy(), np.float32)
@@ -248,6 +254,20 @@ USD = SplatFormat(
     reader=read_usd,
     suffixes=(".usd", ".usda", ".usdc", ".usdz"),
     writer=SplatWriter(
-        kind="usd", suffix=".usdc", write=_export, world_losses=(Loss("cameras are left out"),)
+        kind="usd",
+        suffix=".usdc",
+        write=_export,
+        world_losses=(
+            Loss("cameras are left out"),
+            Loss(
+                "which way is up is not known, so the stage has no upAxis: OpenUSD then takes y",
+                lambda scene: not scene.has_known_gravity,
+            ),
+            Loss(
+                "how long a unit is is not known, so the stage has no metersPerUnit: OpenUSD then "
+                "takes a centimetre",
+                lambda scene: not scene.has_metric_scale,
+            ),
+        ),
     ),
 )

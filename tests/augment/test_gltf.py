@@ -17,10 +17,12 @@ import torch
 from augment.errors import SceneError
 from augment.files.formats import read_splats
 from augment.files.gltf import read_gltf, write_glb
+from augment.files.spz import write_spz
 from augment.render.sh import evaluate_sh
 from augment.scene.geometry import rotmat_from_quat
 from augment.scene.scene import Gaussians
 from tests.augment.test_splat_formats import some_gaussians
+from tests.augment.test_spz import packed_4, record, version_4_of
 
 KHR = "KHR_gaussian_splatting"
 HALF = math.sqrt(0.5)
@@ -83,6 +85,22 @@ def saved(folder: Path, content: dict[str, Any]) -> Path:
     return path
 
 
+def compressed_document(packed: bytes, count: int, name: str = "spz_2") -> dict[str, Any]:
+    """A .gltf whose splats are a .spz, with the accessors of attributes that hold nothing."""
+    content = document()
+    uri = "data:application/octet-stream;base64," + base64.b64encode(b"1234" + packed).decode()
+    content["buffers"] = [{"byteLength": 4 + len(packed), "uri": uri}]
+    content["bufferViews"] = [{"buffer": 0, "byteOffset": 4, "byteLength": len(packed)}]
+    for accessor in content["accessors"]:
+        del accessor["bufferView"]
+        accessor["count"] = count
+    compression = f"{KHR}_compression_{name}"
+    content["extensionsRequired"] = [KHR, compression]
+    splatting = content["meshes"][0]["primitives"][0]["extensions"][KHR]
+    splatting["extensions"] = {compression: {"bufferView": 0}}
+    return content
+
+
 def covariance(gaussians: Gaussians) -> torch.Tensor:
     axes = rotmat_from_quat(gaussians.quats.double()) * gaussians.scales.double()[:, None]
     return axes @ axes.transpose(1, 2)
@@ -104,6 +122,73 @@ def test_columns_may_be_packed_strided_and_beside_the_file(tmp_path: Path) -> No
     assert found.scales[0].tolist() == pytest.approx([5 / 255, 0.2, 1])
     assert found.quats[0].tolist() == pytest.approx([HALF, 0, 0, HALF], abs=1e-6)
     assert found.sh[0, 0].tolist() == pytest.approx([0.1, 0.2, 0.3])
+
+
+@pytest.mark.parametrize("name", ["spz", "spz_2"])
+@pytest.mark.parametrize("version", [3, 4])
+def test_splats_may_be_a_spz(tmp_path: Path, name: str, version: int) -> None:
+    """Its axes are those of the node, which turns y into z here."""
+    spz = tmp_path / "a.spz"
+    write_spz(spz, some_gaussians(50, 4))
+    packed = spz.read_bytes() if version == 3 else version_4_of(spz)
+    content = compressed_document(packed, 50, name)
+    expected = read_splats(spz).gaussians
+    read = read_gltf(saved(tmp_path, content))
+    assert read.notes == {"up": "+y", "unit": "metre"} and read.problems == ()
+    assert torch.equal(read.gaussians.means, expected.means)
+    assert torch.equal(read.gaussians.sh, expected.sh)
+    content["nodes"][0]["rotation"] = [HALF, 0, 0, HALF]
+    turned = read_gltf(saved(tmp_path, content)).gaussians.means
+    x, y, z = expected.means.unbind(1)
+    torch.testing.assert_close(turned, torch.stack([x, -z, y], dim=1), rtol=0, atol=1e-5)
+
+
+def test_refusals_of_a_spz(tmp_path: Path) -> None:
+    spz = tmp_path / "a.spz"
+    write_spz(spz, some_gaussians(50, 4))
+    packed = spz.read_bytes()
+    bomb = packed_4([bytes(9 * 10**7), b"", b"", b"", b""], count=10**7)
+    nan = packed_4([bytes(9), b"\0", bytes(3), bytes(3), bytes(4)])
+    left_handed = version_4_of(spz, flags=2, records=record(0xADBE0003, b"\x08\0\0\0"))
+    downward = version_4_of(spz, flags=2, records=record(0xADBE0003, b"\x06\0\0\0"))
+    good = compressed_document(packed, 50)
+    splatting = ("meshes", 0, "primitives", 0, "extensions", KHR, "extensions")
+    name = f"{KHR}_compression_spz_2"
+    view = ("bufferViews", 0)
+    cases: dict[str, tuple[dict[str, Any], tuple[Any, ...], Any, str]] = {
+        "cut": (compressed_document(packed[:90], 50), (), None, "its .spz: .*(truncat|whole)"),
+        "empty": (compressed_document(b"", 50), (), None, "not a .spz|places 50 Gaussians"),
+        "noise": (compressed_document(b"x" * 999, 50), (), None, "not a whole .spz"),
+        "a bomb": (compressed_document(bomb, 50), (), None, "announces 10000000 Gaussians"),
+        "many": (compressed_document(packed, 10**9), (), None, "places 1000000000 Gaussians"),
+        "few": (compressed_document(packed, 49), (), None, "holds 50 Gaussians; POSITION says 49"),
+        "one": (compressed_document(nan, 2), (), None, "holds 1 Gaussians; POSITION says 2"),
+        "mirrored": (compressed_document(left_handed, 50), (), None, "RUF are left-handed"),
+        "down": (compressed_document(downward, 50), (), None, r"-y is up; \+y is in glTF"),
+        "version": (compressed_document(b"NGSP\x09" + bytes(99), 50), (), None, "version 9"),
+        "no view": (good, (*splatting, name), {}, f"{name} is not read"),
+        "a text": (good, (*splatting, name, "bufferView"), "0", f"{name} is not read"),
+        "below": (good, (*splatting, name, "bufferView"), -1, f"{name} is not read"),
+        "beyond": (good, (*splatting, name, "bufferView"), 7, "not a whole glTF"),
+        "true": (good, (*splatting, name, "bufferView"), True, f"{name} is not read"),
+        "a list": (good, (*splatting, name), [0], f"{name} is not read"),
+        "two": (good, (*splatting, "EXT_other"), {}, "EXT_other is not read"),
+        "length": (good, (*view, "byteLength"), 10**12, "4 to 1000000000004 of a buffer with"),
+        "offset": (good, (*view, "byteOffset"), 10**12, "takes bytes 1000000000000"),
+        "path": (good, ("buffers", 0, "uri"), "../a.spz", "must lie in the file's folder"),
+        "link": (good, ("buffers", 0, "uri"), "http://a/b", "must lie in the file's folder"),
+        "required": (good, ("extensionsRequired", 0), "KHR_other", "requires KHR_other"),
+    }
+    for case, (content, keys, value, message) in cases.items():
+        changed = copy.deepcopy(content)
+        target = changed
+        for key in keys[:-1]:
+            target = target[key]
+        if keys:
+            target[keys[-1]] = value
+        with pytest.raises(SceneError, match=message):
+            read_splats(saved(tmp_path, changed))
+            pytest.fail(case)
 
 
 def test_negative_scales_are_an_earlier_drafts_logarithms(tmp_path: Path) -> None:

@@ -97,6 +97,17 @@ def one_gaussian() -> tuple[dict[str, Any], dict[str, bytes]]:
     return meta, images
 
 
+def one_gaussian_of_version_1() -> tuple[dict[str, Any], dict[str, bytes]]:
+    """meta.json and the files of the same Gaussian with ranges; its opacity's logit is 1."""
+    meta, images = one_gaussian()
+    del meta["version"], meta["count"], meta["shN"]["count"], meta["shN"]["bands"]
+    meta["means"]["shape"] = [1, 3]
+    meta["scales"] = {"mins": [-8, -8, -16], "maxs": [7.9375] * 3, "files": ["s"]}
+    meta["sh0"] = {"mins": [0, 0, 10, -5], "maxs": [255, 510, 265, 25], "files": ["c"]}
+    meta["shN"] = {"mins": -1, "maxs": 1, "quantization": 8, "files": ["p", "i"]}
+    return meta, images
+
+
 def folder_of(path: Path, meta: dict[str, Any], images: dict[str, bytes]) -> Path:
     path.mkdir()
     (path / "meta.json").write_text(json.dumps(meta))
@@ -156,11 +167,68 @@ def test_a_folder_is_the_zip_unpacked(tmp_path: Path) -> None:
     assert torch.equal(opened.background.means, read_sog(tmp_path / "a.sog").gaussians.means)
 
 
+@pytest.mark.parametrize("has_sh", [True, False])
+def test_version_1_has_ranges_instead_of_codebooks(tmp_path: Path, has_sh: bool) -> None:
+    meta, images = one_gaussian_of_version_1()
+    if not has_sh:
+        del meta["shN"], images["p"], images["i"]
+    (tmp_path / "a.sog").write_bytes(zipped(meta, images))
+    for path in (tmp_path / "a.sog", folder_of(tmp_path / "unbundled", meta, images)):
+        read = read_splats(path).gaussians
+        edge = math.e - 1
+        assert read.means[0].tolist() == pytest.approx([edge, 0, -edge], abs=4e-5)
+        logs = [-8 + 128 / 16, -8 + 144 / 16, -16 + 112 / 255 * 23.9375]
+        assert read.scales[0].log().tolist() == pytest.approx(logs, abs=1e-5)
+        assert read.sh[0, 0].tolist() == pytest.approx([1, 4, 13], abs=1e-5)
+        logit = torch.tensor(-5 + 51 / 255 * 30)
+        assert read.opacities.item() == pytest.approx(float(logit.sigmoid()), abs=1e-6)
+        assert read.sh_degree == (1 if has_sh else 0)
+        if has_sh:  # entry 2 of the palette, pixels 6 to 8
+            codes = torch.tensor([[n, n + 50, n + 100] for n in (6, 7, 8)])
+            torch.testing.assert_close(read.sh[0, 1:], codes / 255 * 2 - 1, rtol=0, atol=1e-6)
+
+
+def test_refusals_of_version_1(tmp_path: Path) -> None:
+    meta, images = one_gaussian_of_version_1()
+    tall = cv2.imencode(".png", np.zeros((1025, 192, 3), np.uint8))[1].tobytes()
+    cases: dict[str, tuple[Callable[[dict[str, Any], dict[str, Any]], object], str]] = {
+        "no shape": (lambda m, f: m["means"].pop("shape"), "means.shape: Field required"),
+        "no count": (lambda m, f: m["means"].update(shape=[]), "means.shape"),
+        "none": (lambda m, f: m["means"].update(shape=[0, 3]), "means.shape.0"),
+        "negative": (lambda m, f: m["means"].update(shape=[-5, 3]), "means.shape.0"),
+        "text": (lambda m, f: m["means"].update(shape=["1", 3]), "means.shape.0"),
+        "a bomb": (lambda m, f: m["means"].update(shape=[10**9, 3]), "announces 1000000000"),
+        "too many": (lambda m, f: m["means"].update(shape=[2, 3]), "1 x 1 pixels for 2 Gaussians"),
+        "no logits": (lambda m, f: m["sh0"].update(mins=[0, 0, 0]), "sh0.mins"),
+        "NaN": (lambda m, f: m["scales"].update(mins=[math.nan, 0, 0]), "scales.mins.0"),
+        "infinite": (lambda m, f: m["shN"].update(maxs=math.inf), "shN.maxs"),
+        "a list": (lambda m, f: m["shN"].update(maxs=[1, 1]), "shN.maxs"),
+        "one file": (lambda m, f: m["shN"].update(files=["p"]), "shN.files"),
+        "outside": (lambda m, f: m["shN"].update(files=["../p", "i"]), "names the file '../p'"),
+        "absolute": (lambda m, f: m["quats"].update(files=["/etc/passwd"]), "'/etc/passwd'"),
+        "missing": (lambda m, f: f.pop("s"), "'s'"),
+        "no image": (lambda m, f: f.update(p=b"x" * 99), "p must be 192, .* got no image"),
+        "a width": (lambda m, f: f.update(p=webp(wide=200)), "got 200 x 1"),
+        "a height": (lambda m, f: f.update(p=tall), "at most 1024 high; got 192 x 1025"),
+        "a label": (lambda m, f: f.update(i=webp((64, 0, 0, 255))), "entry 64 of a palette of 64"),
+        "damaged": (lambda m, f: f.update(p=f["p"][:40]), "p .*damaged"),
+        "version": (lambda m, f: m.update(version=0), "only versions 1 and 2 .*; got 0"),
+    }
+    path = tmp_path / "a.sog"
+    for name, (change, message) in cases.items():
+        changed, files = json.loads(json.dumps(meta)), dict(images)
+        change(changed, files)
+        path.write_bytes(zipped(changed, files))
+        with pytest.raises(SceneError, match=message):
+            read_splats(path)
+            pytest.fail(name)
+
+
 def test_refusals(tmp_path: Path) -> None:
     meta, images = one_gaussian()
     bad = dict[str, tuple[Callable[[dict[str, Any], dict[str, Any]], object], str]]
     cases: bad = {
-        "version": (lambda m, f: m.update(version=3), "only version 2 of SOG is read; got 3"),
+        "version": (lambda m, f: m.update(version=3), "only versions 1 and 2 .*; got 3"),
         "no means": (lambda m, f: m.pop("means"), "does not describe splats"),
         "a codebook": (lambda m, f: m["sh0"].update(codebook=[1.0]), "sh0.codebook: .* 256 items"),
         "not a number": (lambda m, f: m["means"].update(mins=[0, 0, "x"]), "means.mins.2"),

@@ -229,11 +229,8 @@ def test_gaussians_beyond_the_memory_for_a_file_are_refused(tmp_path, kind, monk
     ("name", "content", "message"),
     [
         ("absent.ply", None, r"no such file; expected a \.ply, \.splat, .* or \.usd"),
-        ("a.ply", b"", r"neither a \.ply, .*; convert other splat formats \(\.ksplat\)"),
-        ("a.ksplat", b"\0\1\0\0", r"neither a \.ply, .* nor named \.splat, \.gltf or \.usd"),
-        # .spz files whose first bytes are not gzip's: of version 4, and not packed.
-        ("a.spz", b"NGSP\4\0\0\0" + bytes(100), r"a .spz of version 4; .* version 3"),
-        ("a.spz", b"NGSP\2\0\0\0" + bytes(100), "not packed by gzip"),
+        ("a.ply", b"", r"neither a \.ply, .*; convert other splat formats \(\.lcc\)"),
+        ("a.lcc", b"\0\1\0\0", r"nor named \.splat, \.ksplat, \.gltf or \.usd"),
     ],
 )
 def test_other_files_are_refused(tmp_path, name, content, message):

@@ -194,7 +194,7 @@ WITHOUT_SCALE = [name for name in BASIC if name != "scale_2"]
         (ply(["x", "y", "z", "red", "green", "blue"]), "misses opacity, scale_0.*point cloud"),
         (ply(["x", "y", "z"], extra="element face 0"), "This is a mesh"),
         (ply(WITHOUT_SCALE), "misses scale_2.*2D Gaussians"),
-        (ply(["packed_position"]), "export it as uncompressed"),
+        (ply(["packed_position"]), "expected an element 'chunk'"),
         (ply([]), "it has no properties"),
         (ply([*BASIC, *REST[:10]]), "multiple of 3.*got 10"),
         (ply([*BASIC, *REST[1:10]]), "numbered without gaps"),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from pxr import UsdUtils
+from pxr import Usd, UsdGeom, UsdUtils
 
 from augment.errors import SceneError
 from augment.files.formats import read_splats
@@ -37,6 +37,44 @@ def test_a_usdz_is_read_as_what_it_packs(tmp_path: Path) -> None:
     write_usd(tmp_path / "a.usdc", before, is_upright=True, is_metric=True)
     assert UsdUtils.CreateNewUsdzPackage(str(tmp_path / "a.usdc"), str(tmp_path / "a.usdz"))
     assert torch.equal(read_splats(tmp_path / "a.usdz").gaussians.sh, before.sh)
+
+
+def test_a_written_file_meets_the_rules_that_nvidia_publishes_for_splats(tmp_path: Path) -> None:
+    """SimReady's SPL.001 to SPL.006 and its stage rules, and VG.035 of Omniverse's requirements."""
+    for bands in (1, 4, 9, 16):
+        gaussians = some_gaussians(300, bands)
+        gaussians.quats.mul_(3)  # of any length
+        path = tmp_path / f"{bands}.usdc"
+        write_usd(path, gaussians, is_upright=True, is_metric=True)
+        stage = Usd.Stage.Open(str(path))
+        assert stage.HasAuthoredMetadata("upAxis") and stage.HasAuthoredMetadata("metersPerUnit")
+        assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1
+        root = stage.GetDefaultPrim()
+        assert [prim.GetName() for prim in stage.GetPseudoRoot().GetChildren()] == [root.GetName()]
+        assert UsdGeom.Xform(root)
+        (splat,) = root.GetChildren()
+        assert splat.GetTypeName() == "ParticleField3DGaussianSplat"
+        attributes = {
+            attribute.GetName(): attribute.Get()
+            for attribute in splat.GetAttributes()
+            if attribute.HasAuthoredValue()
+        }
+        count = len(attributes["positions"])
+        assert count == 300
+        for name in ("scales", "orientations", "opacities"):
+            assert len(attributes[name]) == count, name
+        scales = torch.tensor([list(scale) for scale in attributes["scales"]])
+        assert torch.equal(scales, gaussians.scales) and (scales > 0).all()
+        opacities = torch.tensor(list(attributes["opacities"]))
+        assert torch.equal(opacities, gaussians.opacities)
+        lengths = [quat.GetLength() for quat in attributes["orientations"]]
+        assert lengths == pytest.approx([1.0] * count, abs=1e-6)
+        degree = attributes["radiance:sphericalHarmonicsDegree"]
+        coefficients = attributes["radiance:sphericalHarmonicsCoefficients"]
+        assert degree == gaussians.sh_degree and len(coefficients) == count * (degree + 1) ** 2
+        low, high = attributes["extent"]
+        assert all(low[i] <= gaussians.means[:, i].min() for i in range(3))
+        assert all(high[i] >= gaussians.means[:, i].max() for i in range(3))
 
 
 def test_transforms_units_halves_and_defaults(tmp_path: Path) -> None:
