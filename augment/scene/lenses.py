@@ -327,9 +327,14 @@ class FisheyeLens:
         _check_numbers("radial", self.radial, 4)
         _check_limit(self.limit_rad)
 
-    @functools.cached_property
+    @property
     def max_angle_rad(self) -> float:
         """Return `limit_rad`, or the smaller angle at which the polynomial turns back."""
+        return self._max_angle_rad
+
+    @functools.cached_property
+    def _max_angle_rad(self) -> float:
+        """Return `max_angle_rad`, computed once."""
         slope = [(2 * i + 1) * k for i, k in enumerate((1.0, *self.radial))]
         return min(self.limit_rad, math.sqrt(_first_root(slope, math.pi**2)))
 
@@ -445,7 +450,7 @@ class FThetaLens:
         slope = self._reference_polynomial[1]
         return slope if self.reference == "angle_to_distance" else 1 / slope
 
-    @functools.cached_property
+    @property
     def max_angle_rad(self) -> float:
         """Return `limit_rad`, or the smaller angle at which the reference turns back."""
         if self.reference == "angle_to_distance":
