@@ -329,6 +329,11 @@ class FisheyeLens:
 
     @property
     def max_angle_rad(self) -> float:
+        """Return the angle to the optical axis beyond which the lens shows nothing."""
+        return self._max_angle_rad
+
+    @functools.cached_property
+    def _max_angle_rad(self) -> float:
         """Return `limit_rad`, or the smaller angle at which the polynomial turns back."""
         return self._max_angle_rad
 
@@ -452,6 +457,11 @@ class FThetaLens:
 
     @property
     def max_angle_rad(self) -> float:
+        """Return the angle to the optical axis beyond which the lens shows nothing."""
+        return self._max_angle_rad
+
+    @functools.cached_property
+    def _max_angle_rad(self) -> float:
         """Return `limit_rad`, or the smaller angle at which the reference turns back."""
         if self.reference == "angle_to_distance":
             return self._max_argument

@@ -30,12 +30,15 @@ from augment.files.lens_records import lens_record, shutter_record
 from augment.files.recorded_images import decode_image, has_image
 from augment.files.scene_file import read_saved_scene, save_scene_file, scene_document
 from augment.output.calibration import frame_entry, read_camera, trajectory_id
+from augment.scene.boxes import WorldBoxes, outline_world_boxes
 from augment.scene.cameras import Camera, Frame
+from augment.scene.geometry import rotmat_from_quat
 from augment.scene.lenses import FisheyeLens, FThetaLens, Intrinsics, OpenCVLens
 from augment.scene.scene import Gaussians, Scene
 from augment.scene.shutter import RollingShutter
 from augment.scene.sky import ConstantSky
-from recipes.schema import Recipe
+from augment.view.render_view import render_view
+from recipes.schema import Recipe, Render
 from tests.adapters import drivestudio_files as drivestudio
 from tests.adapters import kitti_files as kitti
 from tests.adapters import pandaset_files as pandaset
@@ -548,3 +551,45 @@ def test_samples_of_cameras_with_lenses_refuse_projections_of_pinholes(kitti_sce
     }
     with pytest.raises(ValueError, match="has a lens or a rolling shutter"):
         boxes_2d({**sample, "boxes": boxes})
+
+
+# ---- Pictures ------------------------------------------------------------------------------------
+
+
+def test_the_recorded_photo_comes_back_without_weather(kitti_scene: Scene):
+    recipe = Recipe(name="photo", render=Render(base="recorded"))
+    for frame in kitti_scene.frames:
+        camera = frame.cameras["image_02"]
+        view = render_view(kitti_scene, camera, recipe)
+        recorded = cv2.imread(frame.image_paths["image_02"])
+        assert recorded is not None
+        np.testing.assert_array_equal(view.rgb, recorded[..., ::-1])
+
+
+def test_boxes_are_within_a_pixel_of_their_edges_by_opencv(waymo_drive: RawDrive):
+    assert waymo_drive.recorded_frames is not None
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2
+    pairs = [(a, b) for a in range(8) for b in range(a) if bin(a ^ b).count("1") == 1]
+    share = np.linspace(0, 1, 200)[:, None]
+    num_compared = 0
+    for frame, stamp in zip(waymo_drive.recorded_frames, WAYMO_STAMPS, strict=True):
+        boxes = waymo_drive.labels.boxes(frame.index)
+        for n, name in enumerate(waymo.CAMERA_NAMES):
+            camera = dataclasses.replace(frame.cameras[name], shutter=None)
+            outlines = outline_world_boxes(
+                WorldBoxes.from_labels(boxes, waymo_drive.world_origin_m), camera
+            )
+            for k, centre in enumerate(boxes.centers_m):
+                rotation = rotmat_from_quat(torch.from_numpy(boxes.quats[k])).numpy()
+                places = corners * boxes.sizes_m[k] @ rotation.T + centre
+                edges = np.concatenate(
+                    [places[a] + share * (places[b] - places[a]) for a, b in pairs]
+                )
+                u, v, is_inside = waymo.pixels_of(waymo.Rig(), n, stamp + waymo.MIDDLES_S[n], edges)
+                if not is_inside.all():  # cut by the image's border
+                    continue
+                expected = np.array([u.min(), v.min(), u.max(), v.max()])
+                assert outlines.in_view[k]
+                np.testing.assert_allclose(outlines.xyxy[k], expected, atol=1.0)
+                num_compared += 1
+    assert num_compared >= 2
