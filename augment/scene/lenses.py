@@ -334,7 +334,7 @@ class FisheyeLens:
 
     @functools.cached_property
     def _max_angle_rad(self) -> float:
-        """Return `limit_rad`, or the smaller angle at which the polynomial turns back."""
+        """Return `max_angle_rad`, computed once."""
         slope = [(2 * i + 1) * k for i, k in enumerate((1.0, *self.radial))]
         return min(self.limit_rad, math.sqrt(_first_root(slope, math.pi**2)))
 
