@@ -65,9 +65,9 @@ def _check_pinhole(camera: Mapping[str, Any]) -> None:
     """Raise ValueError for a camera with a lens or a shutter, through which nothing is projected.
 
     Args:
-        camera: `camera` of a sample.
+        camera: `camera` of a sample; one without the two entries is a pinhole.
     """
-    if camera["lens"] is not None or camera["shutter"] is not None:
+    if camera.get("lens") is not None or camera.get("shutter") is not None:
         raise ValueError(
             f"camera {camera['name']!r} has a lens or a rolling shutter, and boxes are projected "
             f"here as a pinhole shows them; take the sample's own modal_xyxy and the box tables, "

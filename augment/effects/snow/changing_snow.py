@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Int64
+from jaxtyping import Int
 from torch import Tensor
 
 from augment.effects.gradient_noise import draw_octaves, find_threshold, sum_octaves
@@ -383,7 +383,7 @@ def _settled_m(depth_m: float) -> float:
 
 
 def define_snow(
-    cells: ChangingCells, state: SnowState, rows: Int64[np.ndarray, "R"] | slice = slice(None)
+    cells: ChangingCells, state: SnowState, rows: Int[np.ndarray, "R"] | slice = slice(None)
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the share of cells that snow covers, and its depth in metres, float64 [R] each.
 
