@@ -27,7 +27,7 @@ from augment.scene.geometry import rigid
 from augment.scene.scene import Actor, Gaussians, Ground, Scene, Track
 from augment.scene.semantics import SemanticClass
 from augment.scene.sky import ConstantSky, CubemapSky, LatLongSky, Sky
-from augment.view.plan import make_plan
+from augment.view.plan import plan_at
 from augment.view.render_view import render_buffers, render_view
 from augment.view.results import WeatheredBuffers, WeatheredView
 from recipes.schema import Recipe
@@ -460,7 +460,7 @@ def outputs(draw: st.DrawFn, data: dict[str, Any]) -> dict[str, Any]:
 def rendered(scene: Scene, camera: Camera, recipe: Recipe) -> WeatheredView:
     """The view, after checking all that is promised of every frame."""
     view = render_view(scene, camera, recipe)
-    plan = make_plan(recipe, scene)
+    _, plan = plan_at(recipe, scene, camera.timestamp_ns)
     buffers = render_buffers(scene, camera.scaled(recipe.render.scale), plan)
     check_buffers(buffers, recipe)
     check_view(view, scene, recipe)
