@@ -21,6 +21,7 @@ LONG_EXAMPLES = {
     "robust_detector",
     "train_detector",
     "train_on_fog",
+    "weather_env",
 }
 MAX_LINES = 64  # an example is read from top to bottom in a few minutes
 

@@ -16,8 +16,9 @@ from augment.errors import OutputError, ScoreError
 from augment.output.store import open_store
 from augment.scores.nuscenes_metric import NuScenesSplit
 from augment.scores.probe import probe
-from augment.scores.score_suite import ScoreOptions, score_suite
+from augment.scores.score_suite import ScoreOptions, add_baseline, score_suite
 from augment.scores.suite_facts import read_suite
+from augment.scores.suite_scores import read_scores
 from augment.scores.truth import coco_truth, read_truth
 from recipes.schema import Category
 from tests.augment.suite_folders import (
@@ -453,14 +454,15 @@ def test_a_baseline_is_read_from_predictions_and_from_json(suite, good_predictio
     ):
         edit_json(path, lambda content, f=field, v=value: {**content, f: v})
         with pytest.raises(ScoreError, match=message):
-            score_suite(store, good_predictions, path)
+            add_baseline(scores, read_scores(path), str(path))
         path.write_text(json.dumps(base.model_dump(mode="json")))
     edit_json(path, lambda content: content["effects"]["fog"]["levels"][4].update(level=7))
     with pytest.raises(ScoreError, match=r"of another levels"):
-        score_suite(store, good_predictions, path)
+        add_baseline(scores, read_scores(path), str(path))
     path.write_text(json.dumps(base.model_dump(mode="json")))
     edit_json(path, lambda content: {**content, "suite_sha256": "0" * 64})
-    assert "other files of weather-c-v1" in score_suite(store, good_predictions, path).warnings[-1]
+    compared = add_baseline(scores, read_scores(path), str(path))
+    assert "other files of weather-c-v1" in compared.warnings[-1]
 
 
 def test_scenes_recorded_in_an_effect_do_not_count_for_it(tmp_path, good_predictions):
