@@ -141,6 +141,7 @@ def test_an_actor_of_a_scene_without_actors_or_of_another_unit_is_refused(tmp_pa
         with_tracks(scene, path, "street", lambda uri: unknown)
 
 
+@pytest.mark.long
 def test_render_and_generate_write_moved_labels_and_say_so(tmp_path: Path) -> None:
     path = write(tmp_path / "t.json", FILE)
     recipe = tmp_path / "labelled.yaml"

@@ -89,6 +89,7 @@ def test_a_kernel_is_compiled_again_when_any_source_changes(monkeypatch, tmp_pat
     assert hits(kernel(double)) == 1
 
 
+@pytest.mark.long
 def test_compiled_kernels_lie_in_the_users_cache_folder_and_not_beside_the_sources(tmp_path):
     code = (
         "from augment.render.cpu.jit import KERNELS\n"

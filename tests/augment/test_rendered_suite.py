@@ -212,6 +212,7 @@ def test_a_changed_suite_json_is_refused(finished: Path, tmp_path: Path):
         verify_suite(store)
 
 
+@pytest.mark.long
 def test_one_changed_byte_among_ten_thousand_files_is_found_soon(finished: Path, tmp_path: Path):
     suite_file = read_suite_file(open_store(finished))
     files = {}

@@ -106,5 +106,5 @@ def test_what_others_show_wrongly_is_told(
 def test_scenes_of_other_kinds_have_no_such_lines(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    facts = inspected("procedural:street?seed=3", capsys, tmp_path)
+    facts = inspected("procedural:street?seed=3&frames=1&gaussians=60000", capsys, tmp_path)
     assert facts["files"] == [] and "  file " not in facts["text"]
