@@ -413,6 +413,7 @@ def found_by(folder: Path, *scenarios: str) -> dict[str, dict]:
     return json.loads(done.stdout)
 
 
+@pytest.mark.long
 def test_killed_jobs_go_on_to_identical_files(quick_folder: Path) -> None:
     assert found_by(quick_folder, "kill_a_few_times")["kill_a_few_times"]["kills"] == 8
 
