@@ -46,7 +46,7 @@ from augment.render.constants import SURFACE_ALPHA
 from augment.render.rasterize import rasterize
 from augment.scene.cameras import Camera, Frame
 from augment.scene.labels import EGO_VEHICLE
-from augment.scene.pinhole_scene import pinhole_scene
+from augment.scene.pinhole_scene import pinhole_frames, pinhole_scene
 from augment.scene.scene import Scene, Track
 
 # Distance from which a surface before the sky fades in any fog and casts no pane, metres.
@@ -883,18 +883,15 @@ def judge_scene(
 
     Args:
         scene: the scene.
-        frames: the frames; None for all.
+        frames: the frames, of the scene or of a camera path; None for all.
         cameras: names of the cameras; None for all.
         scale: size of the pictures over that of the cameras; None leaves magnification out.
         count: frames of each camera that are drawn, small; those of cameras that were never fitted
             are not drawn.
         backend: the rasteriser's backend.
     """
-    pinholes = pinhole_scene(scene)
-    pinhole_frames = {frame.index: frame for frame in pinholes.frames}
-    judged_frames = scene.frames if frames is None else frames
-    frames = [pinhole_frames.get(frame.index, frame) for frame in judged_frames]
-    scene = pinholes
+    scene = pinhole_scene(scene)
+    frames = scene.frames if frames is None else pinhole_frames(tuple(frames))
     names = dict.fromkeys(name for frame in frames for name in frame.cameras)
     chosen_names = [name for name in names if cameras is None or name in cameras]
     judged_cameras = tuple(

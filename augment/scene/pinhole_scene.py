@@ -25,15 +25,18 @@ def pinhole_scene(scene: Scene) -> Scene:
     """
     recorded = None if scene.recorded is None else pinhole_scene(scene.recorded)
     with _lock:
-        changed = _scenes.get(scene)
-        if changed is not None:
-            return changed
-        if recorded is not None and scene.recorded and scene.frames is scene.recorded.frames:
-            frames = recorded.frames
-        else:
-            frames = _pinhole_frames(scene.frames)
-        seen_frames = None if scene.seen_frames is None else _pinhole_frames(scene.seen_frames)
+        if scene in _scenes:
+            return _scenes[scene] or scene
+        frames = pinhole_frames(scene.frames)
+        seen_frames = None if scene.seen_frames is None else pinhole_frames(scene.seen_frames)
+        if recorded is not None and scene.recorded is not None:
+            # `Scene.as_recorded` tells by identity that nothing but actors has changed.
+            if scene.frames is scene.recorded.frames:
+                frames = recorded.frames
+            if scene.seen_frames is scene.recorded.seen_frames:
+                seen_frames = recorded.seen_frames
         if frames is scene.frames and seen_frames is scene.seen_frames:
+            _scenes[scene] = None
             return scene
         changed = dataclasses.replace(
             scene,
@@ -47,14 +50,19 @@ def pinhole_scene(scene: Scene) -> Scene:
         return changed
 
 
-# Scenes with pinhole cameras, by the scene with lenses. Not in the memo that both share: it would
-# keep them for ever.
-_scenes: WeakKeyDictionary[Scene, Scene] = WeakKeyDictionary()
+# Scenes with pinhole cameras, by the scene with lenses; None by a scene that has pinholes only,
+# since a scene that stood for itself would live for ever. For the same reason, they are not in the
+# memo that both share.
+_scenes: WeakKeyDictionary[Scene, Scene | None] = WeakKeyDictionary()
 _lock = threading.Lock()
 
 
-def _pinhole_frames(frames: tuple[Frame, ...]) -> tuple[Frame, ...]:
-    """Return frames with pinhole cameras; the same tuple if they have no others."""
+def pinhole_frames(frames: tuple[Frame, ...]) -> tuple[Frame, ...]:
+    """Return frames with pinhole cameras; the same tuple if they have no others.
+
+    Args:
+        frames: frames of any cameras; orthographic ones stay.
+    """
     if all(
         camera.is_pinhole or camera.is_orthographic
         for frame in frames

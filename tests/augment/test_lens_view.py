@@ -243,6 +243,9 @@ def test_scenes_with_lenses_look_with_pinholes_and_share_what_is_computed(street
     scene = dataclasses.replace(street, frames=frames)
     changed = pinhole_scene(scene)
     assert changed is pinhole_scene(scene)
+    moved = dataclasses.replace(scene, seen_frames=frames, actors=(), recorded=None)
+    moved = dataclasses.replace(moved, actors=street.actors, recorded=moved)
+    assert pinhole_scene(moved).as_recorded is pinhole_scene(moved.as_recorded)
     camera = changed.frames[0].cameras["front"]
     assert camera.is_pinhole
     lens_camera = scene.frames[0].cameras["front"]

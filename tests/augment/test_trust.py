@@ -111,6 +111,13 @@ def test_a_hole_in_the_road_is_counted_named_and_not_trusted():
     below = elevation_rad(camera) < 0
     assert lost / below.mean() == pytest.approx(camera_trust.views[0].ground_open, abs=0.1)
     assert trust_mask(hole, camera)[~below].mean() > 0.95 * 255
+    # A frame of a camera path that looks back, with the number of a recorded frame.
+    ahead = hole.frames[0].cameras["front"]
+    turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
+    back = dataclasses.replace(ahead, camera_from_world=turn @ ahead.camera_from_world)
+    path = [dataclasses.replace(hole.frames[0], cameras={"front": back})]
+    (camera_trust,) = judge_scene(hole, path, ["front"], count=1).cameras
+    assert camera_trust.views[0].ground_open == 0
 
 
 def test_sky_on_a_sheet_is_found_by_the_recorded_image_and_not_trusted(tmp_path):
