@@ -26,6 +26,7 @@ from augment.files.lens_records import LensRecord, lens_record
 from augment.output.atomic import temporary_path
 from augment.scene.cameras import Camera
 from augment.scene.lenses import Intrinsics, Lens
+from augment.scene.pixel_rays import turn_between
 from recipes.files import open_file
 
 UNDISTORTED = "undistorted.json"
@@ -147,10 +148,7 @@ def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
         pinhole: a pinhole camera at the same place, which may be turned.
     """
     assert camera.lens is not None
-    turn = camera.camera_from_world[:3, :3] @ pinhole.camera_from_world[:3, :3].T
-    rows = tuple(turn.flatten().tolist())
-    if torch.equal(camera.camera_from_world, pinhole.camera_from_world):
-        rows = tuple(np.eye(3).ravel().tolist())
+    rows = tuple(turn_between(camera, pinhole).ravel().tolist())
     size = pinhole.width, pinhole.height
     u, v = _maps(camera.lens, camera.intrinsics, pinhole.intrinsics, *size, rows)
     return cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)

@@ -31,6 +31,7 @@ from augment.files.recorded_images import ImageFault, read_scaled
 from augment.memo import memo_of
 from augment.photo.own_car_outline import find_symmetric_outline, refine_outline
 from augment.scene.cameras import Camera, Frame
+from augment.scene.pixel_rays import turn_between, turned_rays
 from augment.scene.scene import Scene
 
 T = TypeVar("T")
@@ -318,8 +319,6 @@ def _car_tops(evidence: np.ndarray, is_unknown: np.ndarray) -> np.ndarray:
 
 # Scale of the images in which the recording car is looked for.
 _SCALE = 0.5
-# Largest entry of a rotation less the identity that is rounding.
-_MIN_TURN = 1e-9
 # Width of the border outside the car in which the weather begins, pixels.
 _BORDER_PX = 2
 
@@ -343,8 +342,8 @@ def own_car_mask(
     shape = memo_of(scene).get(("own car", camera.name), lambda: _shape_in(scene, camera.name))
     if shape is None:
         return None
-    turn = _turn_of_view(camera, lens_camera)
-    if turn is not None:
+    turn = None if lens_camera is None else turn_between(lens_camera, camera)
+    if turn is not None and not np.array_equal(turn, np.eye(3)):
         return _mask_in_turned_view(shape, camera, turn)
     # The place of each pixel's centre in the image of the shape.
     columns = (np.arange(camera.width) + 0.5 - camera.cx) * (
@@ -364,14 +363,6 @@ def own_car_mask(
     return share >= 0.5
 
 
-def _turn_of_view(camera: Camera, lens_camera: Camera | None) -> np.ndarray | None:
-    """Return the rotation from a view's axes to those of its lens, [3, 3]; None without one."""
-    if lens_camera is None:
-        return None
-    turn = (lens_camera.camera_from_world[:3, :3] @ camera.camera_from_world[:3, :3].T).numpy()
-    return None if np.abs(turn - np.eye(3)).max() < _MIN_TURN else turn
-
-
 def _mask_in_turned_view(
     shape: _CarShape, camera: Camera, turn: np.ndarray
 ) -> Bool[np.ndarray, "H W"]:
@@ -382,10 +373,7 @@ def _mask_in_turned_view(
         camera: the view.
         turn: rotation from the view's axes to those of the images, [3, 3].
     """
-    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    x = (columns - camera.cx) / camera.fx
-    y = (rows - camera.cy) / camera.fy
-    rays = np.stack([x, y, np.ones_like(x)], -1) @ turn.T
+    rays = turned_rays(camera, turn)
     is_ahead = rays[..., 2] > 0
     z = np.where(is_ahead, rays[..., 2], 1.0)
     u = shape.camera.fx * rays[..., 0] / z + shape.camera.cx
@@ -453,7 +441,6 @@ def own_car_in_view(
         camera: a camera of the scene, at any scale, or a window of it.
         lens_camera: see `own_car_mask`.
     """
-    turn = _turn_of_view(camera, lens_camera)
 
     def make() -> tuple[OwnCar | None]:  # a value that is None would be made again
         mask = own_car_mask(scene, camera, lens_camera)
@@ -466,9 +453,9 @@ def own_car_in_view(
         return (OwnCar(mask, rows, np.ascontiguousarray(weights[rows])),)
 
     lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    scene = scene.as_recorded
-    key = ("own car in view", camera.name, *lens)
-    return memo_of(scene).get(key if turn is None else (*key, turn.tobytes()), make)[0]
+    turn = np.eye(3) if lens_camera is None else turn_between(lens_camera, camera)
+    key = ("own car in view", camera.name, *lens, turn.tobytes())
+    return memo_of(scene.as_recorded).get(key, make)[0]
 
 
 def _shape_in(scene: Scene, name: str) -> _CarShape | None:

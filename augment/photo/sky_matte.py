@@ -36,6 +36,7 @@ from augment.photo.sky_regions import (
     largest_channel,
 )
 from augment.scene.cameras import Camera, Frame
+from augment.scene.pixel_rays import turn_between, turned_rays
 from augment.scene.scene import Scene
 
 # Difference of an image's proportions from the camera's beyond which it is another camera's.
@@ -214,7 +215,7 @@ def recorded_frame(scene: Scene, camera: Camera) -> Frame | None:
 
 
 def is_same_view(recorded: Camera, camera: Camera) -> bool:
-    """Return True if a camera at any scale, or a window of it, looks as the recorded one."""
+    """Return True if a camera shows the recorded one's whole image, at any scale."""
     if not torch.allclose(recorded.camera_from_world, camera.camera_from_world, rtol=0, atol=1e-6):
         return False
     scales = camera.fx / recorded.fx, camera.fy / recorded.fy
@@ -273,12 +274,8 @@ def _kinds_of_copy(
     if kinds is None:
         return None
     # The lens and its copy are of one camera, whatever the pose of a strip of the image.
-    turn = (lens_camera.camera_from_world[:3, :3] @ view.camera_from_world[:3, :3].T).numpy()
+    rays = turned_rays(view, turn_between(lens_camera, view))
     small = copy.resized(kinds.shape[1], kinds.shape[0])
-    columns, rows = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
-    x = (columns - view.cx) / view.fx
-    y = (rows - view.cy) / view.fy
-    rays = np.stack([x, y, np.ones_like(x)], -1) @ turn.T
     z = np.maximum(rays[..., 2], 1e-6)
     u = np.floor(small.fx * rays[..., 0] / z + small.cx)
     v = np.floor(small.fy * rays[..., 1] / z + small.cy)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Float64
 
 from augment.scene.cameras import Camera
@@ -15,6 +16,8 @@ from augment.scene.pinhole_views import layout_of
 
 # Depth from which a point is before a camera without lens, metres.
 MIN_DEPTH_M = 0.01
+# Decimals of a rotation between cameras: 1e-9 radians are far below a pixel.
+_TURN_DECIMALS = 9
 # Shares of the read-out at which points are projected, to find when they are read.
 _NUM_SHARES = 33
 
@@ -84,6 +87,38 @@ def local_rays(camera: Camera, pixels: Float64[np.ndarray, "N 2"]) -> Float64[np
         return np.concatenate([across, np.ones((len(pixels), 1))], axis=1)
     rays, _ = camera.lens.rays(pixels, camera.intrinsics)
     return rays if camera.lens.is_depth_along_ray else rays / rays[:, 2:]
+
+
+def turn_between(camera: Camera, view: Camera) -> Float64[np.ndarray, "3 3"]:
+    """Return the rotation from a view's axes to a camera's, without its rounding errors.
+
+    So it is the same for all frames of a drive, and serves as a key of what is computed once. It is
+    exactly the identity where both look the same way.
+
+    Args:
+        camera: the camera.
+        view: another camera.
+    """
+    rotation = camera.camera_from_world[:3, :3]
+    if torch.equal(rotation, view.camera_from_world[:3, :3]):  # also where it is not quite rigid
+        return np.eye(3)
+    turn = rotation @ view.camera_from_world[:3, :3].T
+    return np.round(turn.numpy(), _TURN_DECIMALS) + 0.0  # -0.0 is 0.0
+
+
+def turned_rays(
+    view: Camera, camera_from_view: Float64[np.ndarray, "3 3"]
+) -> Float64[np.ndarray, "H W 3"]:
+    """Return the ways for a depth of 1 of a pinhole view's pixels, in the axes of a turned camera.
+
+    Args:
+        view: the view.
+        camera_from_view: rotation of `turn_between`.
+    """
+    columns, rows = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    x = (columns - view.cx) / view.fx
+    y = (rows - view.cy) / view.fy
+    return np.stack([x, y, np.ones_like(x)], -1) @ camera_from_view.T
 
 
 def depth_of(camera: Camera, local_m: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:

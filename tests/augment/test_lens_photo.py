@@ -14,7 +14,9 @@ from augment.errors import SceneError
 from augment.photo.lens_photo import transfer_change
 from augment.photo.own_car import own_car_mask
 from augment.scene.cameras import Camera
-from augment.scene.lenses import OpenCVLens
+from augment.scene.lenses import FisheyeLens, OpenCVLens
+from augment.scene.pinhole_views import layout_of
+from augment.scene.pixel_rays import turn_between
 from augment.scene.scene import Scene
 from augment.scene.shutter import RollingShutter
 from augment.view.render_view import render_view
@@ -144,7 +146,9 @@ def test_pictures_do_not_depend_on_the_order_of_views(street, tmp_path):
     scene = photographed(street, tmp_path)
     camera = only_camera(scene)
     first = render_view(scene, camera, recipe(visibility_m=60.0)).rgb
-    again = render_view(photographed(street, tmp_path), camera, recipe(visibility_m=60.0)).rgb
+    other = photographed(street, tmp_path)
+    render_view(other, camera, recipe(visibility_m=30.0, scale=1 / 3))
+    again = render_view(other, camera, recipe(visibility_m=60.0)).rgb
     np.testing.assert_array_equal(first, again)
 
 
@@ -172,3 +176,16 @@ def test_the_recording_car_is_where_a_turned_view_looks_at_it(street, tmp_path):
     np.testing.assert_array_equal(in_view[is_clear], expected[is_clear])
     same = own_car_mask(scene, pinhole, lens_camera)
     np.testing.assert_array_equal(same, mask)
+
+
+def test_views_of_a_lens_are_turned_by_the_same_numbers_in_all_frames(street):
+    """What is computed once for a view of all images is looked up by this rotation."""
+    cameras = [next(iter(frame.cameras.values())).resized(WIDTH, HEIGHT) for frame in street.frames]
+    wide = [dataclasses.replace(camera, fx=70.0, fy=70.0, lens=FisheyeLens()) for camera in cameras]
+    views = layout_of(wide[0]).views
+    assert len(wide) > 1 and len(views) > 1
+    for view in views:
+        turns = [turn_between(camera, view.camera_for(camera)) for camera in wide]
+        np.testing.assert_allclose(turns[0], view.view_from_camera.T, atol=1e-9)
+        assert len({turn.tobytes() for turn in turns}) == 1
+    np.testing.assert_array_equal(turn_between(wide[0], cameras[0]), np.eye(3))
