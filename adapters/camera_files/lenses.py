@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from augment.scene.lenses import FisheyeLens, Lens, OpenCVLens
+from augment.scene.lenses import OPENCV_ORDER, FisheyeLens, Lens, OpenCVLens
 
 # Parameters of COLMAP's models behind focal lengths and principal point, by our coefficients.
 _COLMAP_PINHOLES = {
@@ -25,8 +25,6 @@ _COLMAP_FISHEYES = {
 }
 # Models of nerfstudio that are OpenCV's pinhole with distortion, or parts of it.
 _NERFSTUDIO_PINHOLES = ("OPENCV", "SIMPLE_RADIAL", "RADIAL", "PINHOLE", "SIMPLE_PINHOLE")
-# Coefficients of OpenCV's pinhole in OpenCV's order.
-_OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
 def colmap_lens(camera: Any) -> Lens | None:
@@ -68,4 +66,4 @@ def _fisheye(coefficients: Mapping[str, float]) -> Lens:
 
 def _pinhole_with_distortion(coefficients: Mapping[str, float]) -> Lens:
     """Return OpenCV's pinhole with distortion; absent coefficients are 0."""
-    return OpenCVLens.from_coefficients([coefficients.get(name, 0.0) for name in _OPENCV_ORDER])
+    return OpenCVLens.from_coefficients([coefficients.get(name, 0.0) for name in OPENCV_ORDER])

@@ -20,13 +20,12 @@ import torch
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter
 
 from augment.scene.cameras import Camera
-from augment.scene.lenses import FisheyeLens, FThetaLens, Lens, OpenCVLens
+from augment.scene.lenses import OPENCV_ORDER, FisheyeLens, FThetaLens, Lens, OpenCVLens
 from augment.scene.shutter import ReadOut, RollingShutter
 
 # Largest number of coefficients of a polynomial that is read.
 _MAX_COEFFICIENTS = 32
-# Coefficients of an OpenCV lens in the order of a file. The first five are always written.
-_OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
+# Coefficients of an OpenCV lens that are always written; the others only where they are not 0.
 _NUM_WRITTEN = 5
 
 
@@ -67,7 +66,7 @@ class OpenCVRecord(_Record):
 
     def lens(self) -> Lens:
         """Return the lens."""
-        return OpenCVLens.from_coefficients([getattr(self, name) for name in _OPENCV_NAMES])
+        return OpenCVLens.from_coefficients([getattr(self, name) for name in OPENCV_ORDER])
 
 
 class FisheyeRecord(_Record):
@@ -167,7 +166,7 @@ def lens_record(lens: Lens) -> dict[str, Any]:
         numbers = (k1, k2, *lens.tangential, k3, k4, k5, k6, *lens.thin_prism)
         coefficients = {
             name: number
-            for place, (name, number) in enumerate(zip(_OPENCV_NAMES, numbers, strict=True))
+            for place, (name, number) in enumerate(zip(OPENCV_ORDER, numbers, strict=True))
             if place < _NUM_WRITTEN or number
         }
         return {"model": "opencv", **coefficients}

@@ -334,9 +334,8 @@ class FisheyeLens:
 
     @functools.cached_property
     def _max_angle_rad(self) -> float:
-        """Return `max_angle_rad`, computed once."""
-        slope = [(2 * i + 1) * k for i, k in enumerate((1.0, *self.radial))]
-        return min(self.limit_rad, math.sqrt(_first_root(slope, math.pi**2)))
+        """Return `limit_rad`, or the smaller angle at which r turns back."""
+        return min(self.limit_rad, math.sqrt(_first_root(self._slope_polynomial, math.pi**2)))
 
     def project(
         self, directions: FloatArray, intrinsics: Intrinsics
@@ -378,8 +377,12 @@ class FisheyeLens:
 
     def _slope(self, angle: FloatArray) -> FloatArray:
         """Return the derivative of `_radius`."""
-        slope = [(2 * i + 1) * k for i, k in enumerate((1.0, *self.radial))]
-        return _evaluate_polynomial(slope, angle * angle)
+        return _evaluate_polynomial(self._slope_polynomial, angle * angle)
+
+    @property
+    def _slope_polynomial(self) -> list[float]:
+        """Return the coefficients of `_slope` in theta^2, from the power 0."""
+        return [(2 * i + 1) * k for i, k in enumerate((1.0, *self.radial))]
 
 
 # ---- F-theta -------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, UInt8
 from scipy.interpolate import RectBivariateSpline
 
 from augment.scene.cameras import Camera
@@ -84,16 +84,11 @@ class PinholeView:
         pose = rigid(rotation, torch.zeros(3, dtype=torch.float64)) @ camera.camera_from_world
         is_turned = not np.array_equal(self.view_from_camera, np.eye(3))
         return dataclasses.replace(
-            camera,
+            camera.without_lens(),
             width=self.width,
             height=self.height,
-            fx=self.intrinsics.fx,
-            fy=self.intrinsics.fy,
-            cx=self.intrinsics.cx,
-            cy=self.intrinsics.cy,
+            **self.intrinsics._asdict(),
             camera_from_world=pose if is_turned else camera.camera_from_world,
-            lens=None,
-            shutter=None,
         )
 
 
@@ -108,10 +103,10 @@ class LensLayout:
     rays: Float32[np.ndarray, "H W 3"]
     """Unit directions of its pixels in the camera's axes; (0, 0, 1) outside."""
 
-    @property
-    def main_view(self) -> Int64[np.ndarray, "H W"]:
+    @functools.cached_property
+    def main_view(self) -> UInt8[np.ndarray, "H W"]:
         """Return the index of the view with the largest weight at each pixel."""
-        return np.argmax([view.weights for view in self.views], axis=0)
+        return np.argmax([view.weights for view in self.views], axis=0).astype(np.uint8)
 
 
 def layout_of(camera: Camera, whole_camera: Camera | None = None) -> LensLayout:
@@ -126,10 +121,16 @@ def layout_of(camera: Camera, whole_camera: Camera | None = None) -> LensLayout:
         ValueError: no pixel of the camera sees anything.
     """
     views = () if whole_camera is None else layout_of(whole_camera).views
-    assert camera.lens is not None
-    return _make_layout(
-        camera.lens, camera.intrinsics, camera.width, camera.height, camera.name, views
-    )
+    lens = camera.lens
+    assert lens is not None
+    layout = _make_layout(lens, camera.intrinsics, camera.width, camera.height, views)
+    if layout is None:
+        raise ValueError(
+            f"camera {camera.name!r}: no pixel of its image of {camera.width}x{camera.height} lies "
+            f"within its {type(lens).__name__} (up to {math.degrees(lens.max_angle_rad):.4g} "
+            f"degrees from the axis); check the lens's numbers and {camera.intrinsics}"
+        )
+    return layout
 
 
 @functools.lru_cache(maxsize=_NUM_LAYOUTS)
@@ -138,26 +139,21 @@ def _make_layout(
     intrinsics: Intrinsics,
     width: int,
     height: int,
-    name: str,
     whole_views: tuple[PinholeView, ...],
-) -> LensLayout:
-    """Return the layout of `layout_of`.
+) -> LensLayout | None:
+    """Return the layout of `layout_of`, None if no pixel sees anything. Cameras with one lens share
+    it, whatever their names.
 
     Args:
         lens: the lens.
         intrinsics: numbers of the image.
         width: width of the image, pixels.
         height: height of the image, pixels.
-        name: name of the camera.
         whole_views: views of the image of which this one is a window; empty for a whole image.
     """
     rays, is_inside = pixel_rays(lens, intrinsics, width, height)
     if not is_inside.any():
-        raise ValueError(
-            f"camera {name!r}: no pixel of its image of {width}x{height} lies within its "
-            f"{type(lens).__name__} (up to {math.degrees(lens.max_angle_rad):.4g} degrees from the "
-            f"axis); check the lens's numbers and {intrinsics}"
-        )
+        return None
     if whole_views:
         rotations = [view.view_from_camera for view in whole_views]
     else:
@@ -457,15 +453,7 @@ def covering_camera(camera: Camera) -> Camera:
         camera.lens, camera.intrinsics, camera.width, camera.height
     )
     return dataclasses.replace(
-        camera,
-        width=width,
-        height=height,
-        fx=intrinsics.fx,
-        fy=intrinsics.fy,
-        cx=intrinsics.cx,
-        cy=intrinsics.cy,
-        lens=None,
-        shutter=None,
+        camera.without_lens(), width=width, height=height, **intrinsics._asdict()
     )
 
 

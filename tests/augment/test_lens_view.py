@@ -124,13 +124,22 @@ def test_depth_of_a_wall_is_z_or_the_distance_as_the_lens_says(street, lens):
     assert is_close.mean() > 0.99
 
 
+def test_cameras_with_one_lens_share_a_layout_and_errors_name_the_camera(street):
+    camera = camera_with(street, BARREL)
+    assert layout_of(dataclasses.replace(camera, name="left")) is layout_of(camera)
+    blind = dataclasses.replace(camera_with(street, FISHEYE), cx=1e4)
+    for name in ("left", "right"):
+        with pytest.raises(ValueError, match=f"camera '{name}': no pixel of its image of 160x96"):
+            layout_of(dataclasses.replace(blind, name=name))
+
+
 def test_nothing_is_seen_outside_of_the_lens(street):
     recipe = LABELLED.model_copy(update={"camera": Sensor(noise=0.02, psf_px=1.0)})
     camera = camera_with(street, FISHEYE)
     view = render_view(street, camera, recipe)
     outside = ~layout_of(camera).is_inside
     assert 0.3 < outside.mean() < 0.7
-    assert view.camera is camera or view.camera.lens == FISHEYE
+    assert view.camera.lens == FISHEYE
     for image in (view.rgb, view.depth_m, view.instance, view.masks["trust"]):
         assert image is not None
         assert not image[outside].any()
@@ -316,6 +325,7 @@ def test_points_are_projected_at_the_time_of_their_row(street):
     for point, pixel in zip(points, pixels, strict=True):
         moment = camera.at_read_out(camera.shutter.share_at(float(pixel[1]), camera.height))
         expected, _ = project_points(moment, point[None])
+        # Between two of 33 poses the way of a point over the image is taken for straight.
         np.testing.assert_allclose(pixel, expected[0], atol=1e-3)
     # And the rays of pixels go through these points.
     rays = pixel_rays_of(camera)
