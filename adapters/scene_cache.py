@@ -58,7 +58,6 @@ from augment.output.atomic import (
 )
 from augment.output.names import STATE_FOLDER
 from augment.render.cpu.kernel_cache import user_cache_folder
-from augment.scene.cameras import Frame
 from augment.scene.labels import LabelSource
 from augment.scene.scene import Scene, is_drawable
 from recipes.files import open_file
@@ -106,20 +105,12 @@ def cached_scene(
                 if can_write:
                     _store(scene, folder, key, limit_bytes)
                 return scene
-    seen_frames = stored_scene.seen_frames
     return replace(
-        stored_scene,
+        with_images_in(path, stored_scene, os.path.abspath(path)),
         source=format_uri(scheme, path, query),
-        frames=_with_images_in(path, stored_scene.frames),
-        seen_frames=None if seen_frames is None else _with_images_in(path, seen_frames),
         labels=open_labels(),
         recorded_source=None,
     )
-
-
-def _with_images_in(path: str, frames: Sequence[Frame]) -> tuple[Frame, ...]:
-    """Return frames whose images below the scene's path are named as the path is."""
-    return tuple(with_images_in(path, frame, os.path.abspath(path)) for frame in frames)
 
 
 def image_folder(name: str, sources: Sequence[Path]) -> Path:

@@ -71,15 +71,7 @@ def open_scene_folder(path: str, query: dict[str, str]) -> Scene:
     if _DATA_KEY in query:
         new_recording = _recording_of_query(query[_DATA_KEY])
         if recorded is not None:
-            frames, seen_frames = (
-                None
-                if of_scene is None
-                else tuple(
-                    with_images_in(new_recording.path, frame, recorded.path) for frame in of_scene
-                )
-                for of_scene in (scene.frames, scene.seen_frames)
-            )
-            scene = dataclasses.replace(scene, frames=frames or (), seen_frames=seen_frames)
+            scene = with_images_in(new_recording.path, scene, recorded.path)
         recorded = new_recording
     try:
         if recorded is None or not recorded.is_there:
@@ -151,10 +143,19 @@ def _recording(uri: str, working_folder: Path) -> Recording | None:
     return Recording(scheme, os.path.normpath(working_folder / path), query)
 
 
-def with_images_in(new: str, frame: Frame, old: str) -> Frame:
-    """Return the frame with image paths moved from the folder `old` to the folder `new`."""
-    paths = {
-        name: str(Path(new, os.path.relpath(path, old))) if path.startswith(old + "/") else path
-        for name, path in frame.image_paths.items()
-    }
-    return dataclasses.replace(frame, image_paths=paths)
+def with_images_in(new: str, scene: Scene, old: str) -> Scene:
+    """Return the scene with image paths moved from the folder `old` to the folder `new`."""
+
+    def moved(frame: Frame) -> Frame:
+        paths = {
+            name: str(Path(new, os.path.relpath(path, old))) if path.startswith(old + "/") else path
+            for name, path in frame.image_paths.items()
+        }
+        return dataclasses.replace(frame, image_paths=paths)
+
+    seen_frames = scene.seen_frames
+    return dataclasses.replace(
+        scene,
+        frames=tuple(map(moved, scene.frames)),
+        seen_frames=None if seen_frames is None else tuple(map(moved, seen_frames)),
+    )

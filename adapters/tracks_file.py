@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Self
@@ -31,6 +32,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from adapters.datasets import DATASETS
+from adapters.detect_format import describe_unrecognised, detect_scheme
 from adapters.plain_files import Number, Text, read_json, validate_content
 from adapters.uri import TRACKS_KEY, add_to_uri, format_uri, parse_uri
 from augment.errors import AdapterError, SceneError
@@ -308,13 +310,19 @@ def _check_same_unit(scene: Scene, other: Scene) -> None:
 def _other_uri(name: str, path: Path, scene_path: str) -> str:
     """Return the URI of another scene.
 
-    It may be built in, or lie in the folder of the file, or in the folder in which the scene lies:
-    a file from elsewhere then opens nothing else of this machine.
+    It may be built in, or lie in the folder of the file, or in the folder in which the scene lies,
+    and its options name no files: a file from elsewhere then opens nothing else of this machine.
     """
     scheme, other_path, query = parse_uri(name)
     where = f"{path}: scene {name!r}"
     if TRACKS_KEY in query:
         raise AdapterError(f"{where} has moved actors itself; take the actor from the recording")
+    for key, value in query.items():
+        if _may_name_a_file(value):
+            raise AdapterError(
+                f"{where}: option {key} may name a file, which an actor's scene must not; got "
+                f"{value!r}, leave it out"
+            )
     dataset = DATASETS.get(scheme or "")
     if dataset is not None and other_path in dataset.builtin:
         return name
@@ -330,6 +338,12 @@ def _other_uri(name: str, path: Path, scene_path: str) -> str:
         )
     if not target.exists():
         raise AdapterError(f"{where}: there is no {target}")
+    scheme = scheme or detect_scheme(target)
     if scheme is None:
-        return str(target)
+        raise AdapterError(f"{where}: {describe_unrecognised(target)}. Or name its scheme")
     return format_uri(scheme, target, query)
+
+
+def _may_name_a_file(value: str) -> bool:
+    """Return True if a value of a URI's query may be a path, or exists as one."""
+    return "/" in value or "\\" in value or value == ".." or os.path.exists(value)

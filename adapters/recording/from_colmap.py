@@ -35,6 +35,7 @@ from augment.files.lens_records import optics_record
 from augment.files.recorded_images import twelve_bits_fault
 from augment.output.codecs import encode_depth
 from augment.scene.cameras import Camera
+from augment.scene.pixel_rays import depth_of, project_local
 
 CAMERA = "camera"  # of images that lie in no folder of their own
 _JPEG_QUALITY = 97
@@ -538,16 +539,11 @@ def _write_depth(
     local = (np.concatenate([points, near]) - centre) @ turn
     local = local[local[:, 2] > 0.1]
     size = np.array([camera.width, camera.height])
-    if camera.lens is None:
-        uv = local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    else:
-        uv, _ = camera.lens.project(local, camera.intrinsics)
+    uv = project_local(camera, local)
     with np.errstate(invalid="ignore"):
         is_in_image = ((uv > 0) & (uv < size)).all(axis=1)
     uv = uv[is_in_image]
-    is_along_ray = camera.lens is not None and camera.lens.is_depth_along_ray
-    distance = np.linalg.norm(local, axis=1) if is_along_ray else local[:, 2]
-    inverse = 1 / distance[is_in_image]
+    inverse = 1 / depth_of(camera, local[is_in_image])
     if len(np.unique(uv.round(), axis=0)) < 4:
         return
     interpolator = LinearNDInterpolator(uv, inverse, fill_value=0.0)

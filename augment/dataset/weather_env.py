@@ -97,6 +97,7 @@ class EnvWeather:
 
         Raises:
             SceneError: the recipe needs a scene, or changes over time without a duration.
+            RecipeError: a timeline goes beyond the duration.
         """
         if isinstance(recipe, str):
             recipe = load_recipe(recipe).resolve(0)
@@ -121,12 +122,13 @@ class EnvWeather:
         end_ns = round(1e9 * (duration_s or 0.0))
         probe_frames = (_empty_frame(0, 0), _empty_frame(1, end_ns))
         probe = stand_in_scene(name, probe_frames, **self._scene_facts)
-        states = (recipe.at(_times(0, end_ns), time_ns) for time_ns in {0, end_ns // 2, end_ns})
+        states = recipe.over_time(SceneTimes(0, end_ns))
+        if not omits_scene_effects:
+            for state in states:
+                check_recipe(state, probe)
         omitted = dict.fromkeys(n for state in states for n in omitted_effects(state, probe))
         self.omitted: tuple[str, ...] = tuple(omitted)
         """Names of the recipe's effects that are left out."""
-        if omitted and not omits_scene_effects:
-            check_recipe(recipe.at(_times(0, end_ns), 0), probe)
 
     @property
     def recipe(self) -> Recipe:
@@ -216,8 +218,13 @@ class EnvWeather:
             )
         is_surface = np.isfinite(depth_m) & (depth_m > 0) & (depth_m < self._max_depth_m)
         if self._sky_classes and classes is not None:
-            class_image = np.asarray(classes).reshape(size)
-            is_surface &= ~np.isin(class_image, self._sky_classes)
+            class_image = np.asarray(classes)
+            if class_image.shape not in (size, (*size, 1)):
+                raise SceneError(
+                    f"camera {camera.name!r}: semantic must be {list(size)}, as cam_params state; "
+                    f"got {list(class_image.shape)}"
+                )
+            is_surface &= ~np.isin(class_image.reshape(size), self._sky_classes)
         if self._depth == "ray":
             depth_m = depth_m / camera.ray_lengths().numpy()
         return np.where(is_surface, depth_m, np.float32(0))
@@ -357,8 +364,3 @@ def _required(mapping: Mapping[str, Any], key: str, where: str) -> Any:
 def _empty_frame(index: int, timestamp_ns: int) -> Frame:
     """Return a frame without cameras."""
     return Frame(index, timestamp_ns, torch.eye(4, dtype=torch.float64), {})
-
-
-def _times(first_ns: int, last_ns: int) -> SceneTimes:
-    """Return the times of an episode."""
-    return SceneTimes(first_ns, last_ns, 2)

@@ -28,7 +28,7 @@ from pydantic.dataclasses import dataclass
 from augment.errors import AdapterError, OutputError
 from augment.files.image_size import decode_pixels, image_header
 from augment.files.stated_sizes import StatedSizeError, check_row_group
-from augment.output.atomic import temporary_path
+from augment.files.undistorted_images import write_copy
 from augment.output.tables import open_parquet
 from recipes.files import open_file
 
@@ -288,7 +288,7 @@ class PackedImages(BaseModel):
         Raises:
             AdapterError: the table is damaged, or the folder cannot be written.
         """
-        _write(folder / PACKED, self.model_dump_json().encode())
+        write_copy(folder / PACKED, self.model_dump_json().encode())
         faults: dict[str, str] = {}
         missing_names = {name for name in written_names if not (folder / name).is_file()}
         reader = RowReader(Path(self.table), {self.column: FILE_BYTES}, _IMAGES_AT_ONCE)
@@ -399,19 +399,5 @@ def _unpack(job: tuple[Path | None, Any, Lens]) -> str:
             return "cannot be decoded"
         quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
         data = cv2.imencode(".jpg", lens.undistort(image), quality)[1].tobytes()
-    _write(path, data)
+    write_copy(path, data)
     return ""
-
-
-def _write(path: Path, data: bytes) -> None:
-    """Write a file atomically."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        new = temporary_path(path)
-        new.write_bytes(data)
-        os.replace(new, path)
-    except OSError as error:
-        raise AdapterError(
-            f"{path} cannot be written ({error.strerror or error}); images without distortion are "
-            f"kept there, set XDG_CACHE_HOME to a folder with room for them"
-        ) from error

@@ -46,6 +46,7 @@ def pinhole_scene(scene: Scene) -> Scene:
             recorded=recorded,
         )
         share_memo(scene, changed)
+        share_memo(scene.as_recorded, changed.as_recorded)
         _scenes[scene] = changed
         return changed
 

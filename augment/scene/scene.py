@@ -532,6 +532,18 @@ class Ground:
             )
 
 
+# Fields that a moved scene shares with its recorded one, and that decide what is computed for it.
+_SHARED_FACTS = (
+    "frames",
+    "seen_frames",
+    "world_origin_m",
+    "ground",
+    "color_maps",
+    "image_color_maps",
+    "ego_masks",
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """All facts about a drive, in one world: metres, right-handed, +z up."""
@@ -615,17 +627,19 @@ class Scene:
 
         All that does not depend on the places of actors is computed for this scene, so that it is
         computed once for any number of moves. A scene whose background or sky was replaced after
-        the move is taken as it is; one whose frames were replaced has these frames here, too.
+        the move is taken as it is; one whose name, frames or other facts were replaced has them
+        here, too.
         """
         base = self.recorded
         if base is None or base.background is not self.background or base.sky is not self.sky:
             return self
-        is_same = base.frames is self.frames and base.seen_frames is self.seen_frames
-        return base if is_same else self._recorded_in_frames
+        has_same_facts = all(getattr(base, name) is getattr(self, name) for name in _SHARED_FACTS)
+        is_same = has_same_facts and (base.name, base.ground_z_m) == (self.name, self.ground_z_m)
+        return base if is_same else self._recorded_with_facts
 
     @cached_property
-    def _recorded_in_frames(self) -> Scene:
-        """Return the scene as it was recorded, with the frames of this one."""
+    def _recorded_with_facts(self) -> Scene:
+        """Return the scene as it was recorded, with the name, frames and facts of this one."""
         assert self.recorded is not None
         base = self.recorded
         return replace(self, actors=base.actors, labels=base.labels, recorded=None)

@@ -37,6 +37,7 @@ from augment.render.fog_image import image_optical_depth, sky_image_depth
 from augment.render.sensor import add_noise, blur_lens
 from augment.scene.cameras import Camera, Frame
 from augment.scene.scene import Gaussians, Scene
+from augment.scene.scene_times import times_of_drive
 from augment.scene.sky import ConstantSky
 from augment.view.layers import LayerRenderer
 from recipes.moment import SceneTimes
@@ -180,8 +181,7 @@ def weather_picture(picture: GivenPicture, scene: Scene, recipe: Recipe) -> Weat
 
 def _times_of(scene: Scene) -> SceneTimes:
     """Return the times of a stand-in scene's frames."""
-    times_ns = [frame.timestamp_ns for frame in scene.frames]
-    return SceneTimes(min(times_ns), max(times_ns), len(times_ns))
+    return times_of_drive((), [frame.timestamp_ns for frame in scene.frames])
 
 
 def _needs_scene(effect: Effect, recipe: Recipe, scene: Scene) -> bool:

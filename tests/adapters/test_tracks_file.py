@@ -7,7 +7,7 @@ import pytest
 
 from adapters.base import open_scene
 from adapters.scene_cache import scene_digest
-from adapters.tracks_file import with_tracks
+from adapters.tracks_file import other_scenes, with_tracks
 from augment.errors import AdapterError, ClimateGSError
 from augment.output.manifest import read_manifest
 from augment.scene.moved_actors import RECORDED_SWEEPS
@@ -74,11 +74,20 @@ def test_the_digest_of_a_scene_is_of_the_file_too(tmp_path: Path) -> None:
     assert scene_digest(uri) == first
 
 
+def test_another_scene_without_a_scheme_keeps_its_options(tmp_path: Path) -> None:
+    splats = tmp_path / "other.ply"
+    splats.write_bytes(b"ply\nformat binary_little_endian 1.0\n")
+    added = {"track_id": "a", "copy_of": CAR, "poses": POSES, "scene": "other.ply?up=-y"}
+    uris = list(other_scenes(write(tmp_path / "t.json", {"add": [added]}), "street"))
+    assert uris == [f"gaussians:{splats}?up=-y"]
+
+
 def test_files_that_cannot_be_used_are_refused_in_words(tmp_path: Path) -> None:
     scene = open_street(LABELLED_STREET)
     path = tmp_path / "t.json"
     outside = tmp_path.parent / "elsewhere"
     outside.mkdir(exist_ok=True)
+    (tmp_path / "nothing").mkdir()
     still = {"time_s": 0, "position_m": [0, 0, 0]}
     added = {"track_id": "a", "copy_of": CAR, "poses": POSES}
 
@@ -107,6 +116,8 @@ def test_files_that_cannot_be_used_are_refused_in_words(tmp_path: Path) -> None:
         ({"add": [{**added, "scene": "scene:/etc/passwd"}]}, "lies outside of"),
         ({"add": [{**added, "scene": "not-there"}]}, "there is no"),
         ({"add": [{**added, "scene": f"{LABELLED_STREET}&tracks=t.json"}]}, "moved actors itself"),
+        ({"add": [{**added, "scene": "scene:.?data=/etc/passwd"}]}, "option data may name a file"),
+        ({"add": [{**added, "scene": "nothing"}]}, "Looked for"),
         (
             {"add": [{**added, "scene": LABELLED_STREET.replace("moving=1", "moving=0")}]},
             f"no actor '{CAR}'",

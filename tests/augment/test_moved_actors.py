@@ -266,6 +266,9 @@ def test_a_moved_scene_with_other_frames_is_recorded_in_these_frames() -> None:
     assert recorded.actors is scene.as_recorded.actors
     assert recorded is fewer.as_recorded
     assert scene.as_recorded is scene.recorded
+    renamed = dataclasses.replace(scene, name="renamed")  # snow and streaks depend on the name
+    assert renamed.as_recorded.name == "renamed"
+    assert renamed.as_recorded is renamed.as_recorded
     plain, _ = street()
     assert plain.as_recorded is plain
 

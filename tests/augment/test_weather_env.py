@@ -115,12 +115,18 @@ def test_effects_that_need_a_scene_are_refused_or_left_out_on_demand() -> None:
     ):
         with pytest.raises(ClimateGSError, match=name):
             EnvWeather(recipe_of(f"version: 1\nname: x\n{text}\n"))
+    later = "{timeline: [[0, 0], [3, 0], [4, 0.1], [5, 0]]}"  # not at start, middle or end
+    text = f"version: 1\nname: x\nweather: {{snow: {{depth_m: {later}}}}}\n"
+    with pytest.raises(ClimateGSError, match="snow"):
+        EnvWeather(recipe_of(text), duration_s=6.0)
+    assert "snow" in EnvWeather(recipe_of(text), duration_s=6.0, omits_scene_effects=True).omitted
 
 
 def test_observations_that_do_not_fit_are_refused_in_words() -> None:
     observation, info = DepthEnv().observe()
     short = {**observation, "rgb": {"front": observation["rgb"]["front"][:-1]}}
     shallow = {**observation, "depth": {"front": observation["depth"]["front"][:, :-1]}}
+    coarse = {**observation, "semantic": {"front": observation["semantic"]["front"][::2]}}
     other = {**observation, "rgb": {"left": observation["rgb"]["front"]}}
     floats = {**observation, "rgb": {"front": observation["rgb"]["front"] / 255}}
     skewed = {"front": {"intrinsic": INTRINSIC, "v2c": np.eye(4) * 2}}
@@ -130,6 +136,7 @@ def test_observations_that_do_not_fit_are_refused_in_words() -> None:
         (floats, info, "rgb must be uint8"),
         (shallow, info, "depth must be"),
         (other, info, "no 'front'; it has left"),
+        (coarse, info, "semantic must be"),
         (observation, {}, "no 'ego_pos'"),
         (observation, {**info, "timestamp": math.nan}, "timestamp must be finite"),
         (observation, {**info, "ego_pos": [0, math.inf, 0]}, "finite numbers"),
@@ -139,7 +146,7 @@ def test_observations_that_do_not_fit_are_refused_in_words() -> None:
     ]
     for bad_observation, bad_info, words in cases:
         with pytest.raises(ClimateGSError, match=words):
-            EnvWeather(recipe_of(FOG)).apply(bad_observation, bad_info)
+            EnvWeather(recipe_of(FOG), sky_classes=(10,)).apply(bad_observation, bad_info)
     weather = EnvWeather(recipe_of(FOG))
     weather.apply(observation, {**info, "timestamp": 5.0})
     with pytest.raises(ClimateGSError, match="time went back"):

@@ -360,9 +360,7 @@ def build_snow_layers(
     Raises:
         SceneError: this scene cannot have snow, or not with cells this small.
     """
-    light = None if light is scene or light is None else light.as_recorded
-    scene = scene.as_recorded
-    light = None if light is scene else light
+    scene, light = _recorded_scenes(scene, light)
     exposed_surface = _exposed_surface(scene, recipe_snow, backend)
 
     def build_layers() -> SnowLayers:
@@ -386,9 +384,7 @@ def build_changing_layers(
     The arguments and errors are those of `build_snow_layers`.
     """
     plan = laid_plan(recipe_snow)
-    light = None if light is scene or light is None else light.as_recorded
-    scene = scene.as_recorded
-    light = None if light is scene else light
+    scene, light = _recorded_scenes(scene, light)
     exposed_surface = _exposed_surface(scene, plan, backend)
 
     def build_layers() -> ChangingLayers:
@@ -396,6 +392,13 @@ def build_changing_layers(
         return lay_changing_snow(exposed_surface, scene, plan, illumination)
 
     return memo_of(scene).get(("changing snow", plan, exposed_surface, light), build_layers)
+
+
+def _recorded_scenes(scene: Scene, light: Scene | None) -> tuple[Scene, Scene | None]:
+    """Return the scene as recorded, and that of its light; None if they are the same."""
+    recorded_light = None if light is None else light.as_recorded
+    scene = scene.as_recorded
+    return scene, None if recorded_light is scene else recorded_light
 
 
 def _exposed_surface(scene: Scene, recipe_snow: SnowPlan, backend: str) -> ExposedSurface:
