@@ -464,6 +464,7 @@ REFUSED = [
     ({"image_format": 3}, "UNIMPLEMENTED", "JPEG2000"),
     ({"image_format": 77}, "INVALID_ARGUMENT", "77"),
     ({"image_quality": NAN}, "INVALID_ARGUMENT", "image_quality"),
+    ({"image_quality": 0.4}, "INVALID_ARGUMENT", "image_quality"),
     ({"insert_ego_mask": True}, "NOT_FOUND", "has masks of front"),
     ({"camera_intrinsics__logical_id": "x" * 999}, "INVALID_ARGUMENT", "200 characters"),
     (

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 import threading
 import time
 import traceback
@@ -279,11 +278,6 @@ class SensorService:
         """Begin the image of an `RGBRenderRequest`; its scene stays open until the stack closes."""
         call.check()
         check_format(request)
-        quality = request.image_quality
-        if not (math.isfinite(quality) and 0 <= quality <= 100):
-            raise invalid(
-                f"image_quality must be from 1 to 100, or 0 for the default; got {quality}"
-            )
         facts = self._store.facts(request.scene_id)
         camera = requested_camera(request, facts, self._limits.max_pixels)
         size = f"{camera.width}x{camera.height}"
