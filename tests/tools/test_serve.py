@@ -45,6 +45,7 @@ from tools.serve.messages import (
     methods,
     service_names,
 )
+from tools.serve.metrics import NUM_LATENCIES, Metrics
 from tools.serve.poses import pose_matrix, pose_message
 from tools.serve.scene_store import parse_source
 from tools.serve.server import RunningService, served_recipes, start_service
@@ -591,11 +592,31 @@ def test_a_deadline_ends_the_work(server):
     assert server.stub.render_rgb(image_request("street", server.camera())).image_bytes
 
 
-def test_metrics_count_requests_by_status(server):
-    facts = server.running.metrics.facts()["methods"]["render_rgb"]
-    assert facts["count"] == sum(facts["by_status"].values())
-    assert facts["by_status"]["NOT_FOUND"] >= 3
-    assert 0 < facts["p50_ms"] <= facts["p90_ms"] <= facts["p99_ms"]
+def test_metrics_count_requests_by_status():
+    metrics = Metrics()
+    for milliseconds in range(1, 101):
+        metrics.begin()
+        metrics.end("render_rgb", "OK", milliseconds / 1000)
+    metrics.begin()
+    metrics.end("render_rgb", "NOT_FOUND", 60.0)
+    metrics.begin()
+    facts = metrics.facts()["methods"]["render_rgb"]
+    assert metrics.num_in_flight == 1
+    assert facts["count"] == 101
+    assert facts["by_status"] == {"NOT_FOUND": 1, "OK": 100}
+    # Percentiles of 1 to 100 ms, between two values: refusals are not counted.
+    assert [facts[f"p{n}_ms"] for n in (50, 90, 99)] == [50.5, 90.1, 99.01]
+
+
+def test_percentiles_are_those_of_the_latest_latencies():
+    metrics = Metrics()
+    for seconds in (9.0, 0.002):
+        for _ in range(NUM_LATENCIES):
+            metrics.begin()
+            metrics.end("render_rgb", "OK", seconds)
+            metrics.begin()
+            metrics.end("render_rgb", "NOT_FOUND", 1.0)
+    assert metrics.facts()["methods"]["render_rgb"]["p99_ms"] == 2.0
 
 
 # ---- The command ---------------------------------------------------------------------------------
