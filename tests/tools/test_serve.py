@@ -432,7 +432,18 @@ def test_lidar_far_from_every_sweep_is_not_implemented(server):
     request = sweep_request(server, 0)
     request.sensor_pose.end_pose.vec.y += 30
     code, text = refusal(server.stub.render_lidar, request)
-    assert code == "UNIMPLEMENTED" and "nearest recorded sweep" in text
+    assert code == "UNIMPLEMENTED" and "no recorded sweep near this pose" in text
+
+
+def test_a_sweep_within_reach_is_returned_though_another_is_nearer_in_time(server):
+    request = sweep_request(server, 0)
+    expected = server.stub.render_lidar(request).num_points
+    # Aside of the first frame and behind it: 7.9 m from it, 8.2 m from the second.
+    request.sensor_pose.end_pose.vec.x -= 3.0
+    request.sensor_pose.end_pose.vec.y += 7.08
+    request.frame_start_us += 60_000_000
+    request.frame_end_us += 60_000_000
+    assert server.stub.render_lidar(request).num_points == expected
 
 
 def test_one_request_may_have_images_and_sweeps(server):

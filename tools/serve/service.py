@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import threading
 import time
 import traceback
@@ -30,7 +31,7 @@ from augment.scene.scene import Scene
 from recipes.errors import RecipeError
 from recipes.schema import Recipe
 from tools.serve.actors import RequestedScene, requested_scene
-from tools.serve.cameras import available_camera, has_same_intrinsics, requested_camera
+from tools.serve.cameras import available_camera, has_same_intrinsics, image_size, requested_camera
 from tools.serve.drawing import DrawingThreads, check_format, encode_for
 from tools.serve.errors import RequestEnded, RequestRefused, invalid, quote_text
 from tools.serve.lidar import requested_sweep
@@ -45,6 +46,7 @@ from tools.serve.messages import (
 )
 from tools.serve.metrics import Metrics
 from tools.serve.poses import pose_message
+from tools.serve.scene_facts import SceneFacts
 from tools.serve.scene_store import OpenScene, SceneStore
 
 _LOG = logging.getLogger(__name__)
@@ -333,8 +335,7 @@ class SensorService:
 
     def _render_lidar(self, request: Any, call: Call) -> Any:
         call.check()
-        call.subjects.append(request.scene_id)
-        facts = self._store.facts(request.scene_id)
+        facts = self._named_facts(request, call)
         with self._store.borrow(request.scene_id, call.check) as (opened, recipe):
             work = self._threads.submit(
                 lambda: requested_sweep(request, opened.scene, recipe, facts)
@@ -342,6 +343,15 @@ class SensorService:
             return wait_for_result(work)
 
     # ---- Facts -----------------------------------------------------------------------------------
+
+    def _named_facts(self, request: Any, call: Call) -> SceneFacts:
+        """Return the facts of a request's scene, whose name is noted for the log.
+
+        An unknown name is in the refusal, shortened: the log gets no text of any length.
+        """
+        facts = self._store.facts(request.scene_id)
+        call.subjects.append(request.scene_id)
+        return facts
 
     def _get_version(self, request: Any, call: Call) -> Any:
         version_class = message_class("common.VersionId")
@@ -355,14 +365,12 @@ class SensorService:
         return message_class("common.AvailableScenesReturn")(scene_ids=self._store.scene_ids)
 
     def _get_available_cameras(self, request: Any, call: Call) -> Any:
-        call.subjects.append(request.scene_id)
-        facts = self._store.facts(request.scene_id)
+        facts = self._named_facts(request, call)
         cameras = [available_camera(camera) for camera in facts.cameras]
         return message_class("AvailableCamerasReturn")(available_cameras=cameras)
 
     def _get_available_trajectories(self, request: Any, call: Call) -> Any:
-        call.subjects.append(request.scene_id)
-        facts = self._store.facts(request.scene_id)
+        facts = self._named_facts(request, call)
         response = message_class("AvailableTrajectoriesReturn")()
         trajectory = response.available_trajectories.add().trajectory
         for timestamp_us, world_from_rig in facts.path:
@@ -385,11 +393,7 @@ def _check_batch(requests: Any) -> None:
         raise invalid(
             f"a request may ask for {MAX_BATCH_IMAGES} images, at most; got {len(requests)}"
         )
-    num_pixels = 0
-    for request in requests:
-        spec = request.camera_intrinsics
-        width = request.resolution_w or spec.resolution_w
-        num_pixels += width * (request.resolution_h or spec.resolution_h)
+    num_pixels = sum(math.prod(image_size(request)) for request in requests)
     if num_pixels > MAX_BATCH_PIXELS:
         raise invalid(
             f"the images of a request may have {MAX_BATCH_PIXELS} pixels together, at most; got "
