@@ -15,6 +15,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import grpc
@@ -38,11 +39,10 @@ from tools.serve.lidar import requested_sweep
 from tools.serve.messages import (
     INTERFACE_VERSION,
     MAX_MESSAGE_BYTES,
-    PACKAGES,
-    SERVICE,
     Method,
     message_class,
     methods,
+    service_names,
 )
 from tools.serve.metrics import Metrics
 from tools.serve.poses import pose_message
@@ -159,8 +159,7 @@ class SensorService:
             for method in methods()
         }
         return [
-            grpc.method_handlers_generic_handler(f"{package}.{SERVICE}", handler_by_name)
-            for package in PACKAGES
+            grpc.method_handlers_generic_handler(name, handler_by_name) for name in service_names()
         ]
 
     # ---- From bytes to bytes ---------------------------------------------------------------------
@@ -453,8 +452,6 @@ def _with_ego_mask(rgb: np.ndarray, scene: Scene, camera: Camera, recipe: Recipe
         frame = min(frames, key=lambda frame: abs(frame.timestamp_ns - camera.timestamp_ns))
         recorded = frame.cameras[camera.name]
         with contextlib.suppress(ImageFault):
-            from pathlib import Path
-
             path = Path(frame.image_paths[camera.name])
             photo = read_scaled(path, recorded, recorded.resized(camera.width, camera.height))
     return np.where(mask[..., None], photo, rgb)
