@@ -299,11 +299,12 @@ class SensorService:
             frame_end_us=request.frame_end_us,
             dynamic_objects=request.dynamic_objects,
         )
-        key = (opened.name, key_message.SerializeToString(deterministic=True))
+        scene_name = opened.facts.name
+        key = (scene_name, key_message.SerializeToString(deterministic=True))
         moved = call.moved_scenes.get(key)
         if moved is None:
             moved = call.moved_scenes[key] = requested_scene(request, opened.scene)
-            self._note_unknown_tracks(opened.name, moved.unknown_tracks)
+            self._note_unknown_tracks(scene_name, moved.unknown_tracks)
         return moved.scene
 
     def _note_unknown_tracks(self, scene_name: str, track_ids: Sequence[str]) -> None:
