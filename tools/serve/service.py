@@ -7,16 +7,17 @@ sentence. Drawing is left to `DrawingThreads`, scenes to `SceneStore`.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import math
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import grpc
 import numpy as np
@@ -47,8 +48,9 @@ from tools.serve.messages import (
 from tools.serve.metrics import Metrics
 from tools.serve.poses import pose_message
 from tools.serve.scene_facts import SceneFacts
-from tools.serve.scene_store import OpenScene, SceneStore
+from tools.serve.scene_store import OpenScene, SceneStore, scene_name
 
+Item = TypeVar("Item")
 _LOG = logging.getLogger(__name__)
 # Pixels of all images of a batch, at most: as many as a message can hold without compression.
 MAX_BATCH_PIXELS = MAX_MESSAGE_BYTES // 3
@@ -71,8 +73,8 @@ class Call:
         self._context = context
         self.subjects: list[str] = []
         """Scenes and cameras that the request names, for the log."""
-        self.moved_scenes: dict[tuple[str, bytes], RequestedScene] = {}
-        """Scenes by name and moving objects: images of one step have the same."""
+        self.moved_scenes: dict[bytes, RequestedScene] = {}
+        """The scene in use by its moving objects: images of one step have the same."""
 
     def check(self) -> None:
         """Raise RequestEnded if nobody waits for the response any more."""
@@ -239,18 +241,20 @@ class SensorService:
         _check_batch([item.request for item in items])
         item_class = message_class("BatchRGBRenderReturnItem")
         response = message_class("BatchRGBRenderReturn")()
-        with contextlib.ExitStack() as stack:
-            begun_images = [self._try_to_begin(item.request, call, stack) for item in items]
-            for item, begun in zip(items, begun_images, strict=True):
-                answer = item_class(camera_name=item.camera_name)
-                try:
-                    if isinstance(begun, Exception):
-                        raise begun
-                    answer.result.CopyFrom(self._finish_image(begun))
-                    answer.success = True
-                except (ClimateGSError, RecipeError) as error:
-                    answer.error_message = str(error)[:_MAX_TEXT_LENGTH]
-                response.items.append(answer)
+        for run in _runs_of_scenes(items, lambda item: item.request):
+            call.moved_scenes.clear()
+            with contextlib.ExitStack() as stack:
+                begun_images = [self._try_to_begin(item.request, call, stack) for item in run]
+                for item, begun in zip(run, begun_images, strict=True):
+                    answer = item_class(camera_name=item.camera_name)
+                    try:
+                        if isinstance(begun, Exception):
+                            raise begun
+                        answer.result.CopyFrom(self._finish_image(begun))
+                        answer.success = True
+                    except (ClimateGSError, RecipeError) as error:
+                        answer.error_message = str(error)[:_MAX_TEXT_LENGTH]
+                    response.items.append(answer)
         return response
 
     def _render_aggregated(self, request: Any, call: Call) -> Any:
@@ -258,9 +262,11 @@ class SensorService:
         if len(request.lidar_requests) > MAX_BATCH_IMAGES:
             raise invalid(f"a request may ask for {MAX_BATCH_IMAGES} sweeps, at most")
         response = message_class("AggregatedRenderReturn")()
-        with contextlib.ExitStack() as stack:
-            pending = [self._begin_image(rgb, call, stack) for rgb in request.rgb_requests]
-            response.rgb_returns.extend(map(self._finish_image, pending))
+        for run in _runs_of_scenes(request.rgb_requests, lambda rgb: rgb):
+            call.moved_scenes.clear()
+            with contextlib.ExitStack() as stack:
+                pending = [self._begin_image(rgb, call, stack) for rgb in run]
+                response.rgb_returns.extend(map(self._finish_image, pending))
         response.lidar_returns.extend(
             self._render_lidar(lidar, call) for lidar in request.lidar_requests
         )
@@ -283,9 +289,9 @@ class SensorService:
         camera = requested_camera(request, facts, self._limits.max_pixels)
         size = f"{camera.width}x{camera.height}"
         call.subjects.append(f"{request.scene_id} {quote_text(camera.name)} {size}")
-        opened, recipe = stack.enter_context(self._store.borrow(request.scene_id, call.check))
         if request.insert_ego_mask:
-            _check_ego_mask(request, opened, camera)
+            _check_ego_mask(request, facts, camera)
+        opened, recipe = stack.enter_context(self._store.borrow(request.scene_id, call.check))
         scene = self._moved_scene(request, opened, call)
         finish = self._threads.begin_view(scene, camera, recipe, opened.backend, call.check)
         return _PendingImage(request, opened, recipe, camera, finish)
@@ -299,12 +305,11 @@ class SensorService:
             frame_end_us=request.frame_end_us,
             dynamic_objects=request.dynamic_objects,
         )
-        scene_name = opened.facts.name
-        key = (scene_name, key_message.SerializeToString(deterministic=True))
+        key = key_message.SerializeToString(deterministic=True)
         moved = call.moved_scenes.get(key)
         if moved is None:
             moved = call.moved_scenes[key] = requested_scene(request, opened.scene)
-            self._note_unknown_tracks(scene_name, moved.unknown_tracks)
+            self._note_unknown_tracks(opened.facts.name, moved.unknown_tracks)
         return moved.scene
 
     def _note_unknown_tracks(self, scene_name: str, track_ids: Sequence[str]) -> None:
@@ -387,6 +392,20 @@ class SensorService:
         return response
 
 
+def _runs_of_scenes(items: Iterable[Item], request_of: Callable[[Item], Any]) -> list[list[Item]]:
+    """Return images that follow each other in runs of one scene, which are drawn together.
+
+    The scene of a run is free before that of the next one is borrowed: requests that hold a scene
+    while they wait for another would wait for each other, where few scenes are open.
+
+    Args:
+        items: the images.
+        request_of: returns the `RGBRenderRequest` of an image.
+    """
+    runs = itertools.groupby(items, key=lambda item: scene_name(request_of(item).scene_id))
+    return [list(run) for _, run in runs]
+
+
 def _check_batch(requests: Any) -> None:
     """Refuse a batch whose images are too many, or too large together."""
     if len(requests) > MAX_BATCH_IMAGES:
@@ -404,10 +423,9 @@ def _check_batch(requests: Any) -> None:
 # ---- The recording car ---------------------------------------------------------------------------
 
 
-def _check_ego_mask(request: Any, opened: OpenScene, camera: Camera) -> None:
+def _check_ego_mask(request: Any, facts: SceneFacts, camera: Camera) -> None:
     """Refuse a mask of the recording car that the scene does not have."""
     mask_id = request.ego_mask_id
-    facts = opened.facts
     names = facts.masked_cameras
     if mask_id.rig_config_id == facts.name and mask_id.camera_logical_id in names:
         if mask_id.camera_logical_id != camera.name:
