@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -596,10 +597,20 @@ def test_requests_beyond_the_limit_are_refused_at_once(server):
 
 
 def test_a_deadline_ends_the_work(server):
+    """The client gives up at the deadline by itself; the server's own figures tell what it did."""
     request = image_request("street", server.camera().scaled(3.0))
+    items = [{"camera_name": "front", "request": request}] * 32  # some seconds
+    batch = message_class("BatchRGBRenderRequest")(items=items)
+    metrics = server.running.metrics
     with pytest.raises(grpc.RpcError) as refused:
-        server.stub.render_rgb(request, timeout=0.001)
+        server.stub.batch_render_rgb(batch, timeout=0.5)
     assert refused.value.code() is grpc.StatusCode.DEADLINE_EXCEEDED
+    end_s = time.monotonic() + 60
+    while metrics.num_in_flight > 0 and time.monotonic() < end_s:
+        time.sleep(0.01)
+    statuses = metrics.facts()["methods"]["batch_render_rgb"]["by_status"]
+    # gRPC may call the request cancelled a moment before its time is up.
+    assert {"DEADLINE_EXCEEDED", "CANCELLED"} & set(statuses)
     assert server.stub.render_rgb(image_request("street", server.camera())).image_bytes
 
 
