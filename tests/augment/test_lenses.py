@@ -13,8 +13,9 @@ import torch
 
 from augment.render.rasterize import rasterize
 from augment.scene.cameras import Camera
-from augment.scene.lenses import FisheyeLens, FThetaLens, Intrinsics, Lens, OpenCVLens
+from augment.scene.lenses import FisheyeLens, Intrinsics, Lens, OpenCVLens
 from augment.scene.shutter import RollingShutter, interpolate_pose
+from tests.lenses import F_THETA, F_THETA_CENTRE_PX
 
 # Distortion of KITTI's unrectified image 02 of 2011_09_26, as published.
 KITTI = OpenCVLens.from_coefficients(
@@ -30,29 +31,8 @@ RATIONAL = OpenCVLens(
 )
 FISHEYE = FisheyeLens(radial=(-0.02, 0.003, -0.001, 0.0001), limit_rad=math.radians(100.0))
 FISHEYE_INTRINSICS = Intrinsics(400.0, 410.0, 480.5, 300.0)
-# A published f-theta camera of 960x740.
-F_THETA = FThetaLens(
-    angle_to_distance=(
-        0.0,
-        473.61334228515625,
-        -9.587550163269043,
-        24.94717788696289,
-        -42.338558197021484,
-        15.140613555908203,
-    ),
-    distance_to_angle=(
-        0.0,
-        0.002108694054186344,
-        1.4248414004214283e-07,
-        -8.064807710539412e-10,
-        2.485065538765374e-12,
-        -1.7939406081105393e-15,
-    ),
-    limit_rad=1.3461724520632263,
-    linear=(0.9997570514678955, 6.27807603450492e-05, -0.00010061755892820656),
-)
 F_THETA_INTRINSICS = Intrinsics(
-    F_THETA.slope_px, F_THETA.slope_px, 477.8616638183594 + 0.5, 371.405029296875 + 0.5
+    F_THETA.slope_px, F_THETA.slope_px, F_THETA_CENTRE_PX[0] + 0.5, F_THETA_CENTRE_PX[1] + 0.5
 )
 F_THETA_BACKWARDS = dataclasses.replace(F_THETA, reference="distance_to_angle")
 LENSES: dict[str, tuple[Lens, Intrinsics, tuple[int, int]]] = {

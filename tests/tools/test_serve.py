@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -45,6 +46,7 @@ from tools.serve.messages import (
     methods,
     service_names,
 )
+from tools.serve.metrics import NUM_LATENCIES, Metrics
 from tools.serve.poses import pose_matrix, pose_message
 from tools.serve.scene_store import parse_source
 from tools.serve.server import RunningService, served_recipes, start_service
@@ -431,7 +433,18 @@ def test_lidar_far_from_every_sweep_is_not_implemented(server):
     request = sweep_request(server, 0)
     request.sensor_pose.end_pose.vec.y += 30
     code, text = refusal(server.stub.render_lidar, request)
-    assert code == "UNIMPLEMENTED" and "nearest recorded sweep" in text
+    assert code == "UNIMPLEMENTED" and "no recorded sweep near this pose" in text
+
+
+def test_a_sweep_within_reach_is_returned_though_another_is_nearer_in_time(server):
+    request = sweep_request(server, 0)
+    expected = server.stub.render_lidar(request).num_points
+    # Aside of the first frame and behind it: 7.9 m from it, 8.2 m from the second.
+    request.sensor_pose.end_pose.vec.x -= 3.0
+    request.sensor_pose.end_pose.vec.y += 7.08
+    request.frame_start_us += 60_000_000
+    request.frame_end_us += 60_000_000
+    assert server.stub.render_lidar(request).num_points == expected
 
 
 def test_one_request_may_have_images_and_sweeps(server):
@@ -464,6 +477,7 @@ REFUSED = [
     ({"image_format": 3}, "UNIMPLEMENTED", "JPEG2000"),
     ({"image_format": 77}, "INVALID_ARGUMENT", "77"),
     ({"image_quality": NAN}, "INVALID_ARGUMENT", "image_quality"),
+    ({"image_quality": 0.4}, "INVALID_ARGUMENT", "image_quality"),
     ({"insert_ego_mask": True}, "NOT_FOUND", "has masks of front"),
     ({"camera_intrinsics__logical_id": "x" * 999}, "INVALID_ARGUMENT", "200 characters"),
     (
@@ -583,18 +597,48 @@ def test_requests_beyond_the_limit_are_refused_at_once(server):
 
 
 def test_a_deadline_ends_the_work(server):
+    """The client gives up at the deadline by itself; the server's own figures tell what it did."""
     request = image_request("street", server.camera().scaled(3.0))
+    items = [{"camera_name": "front", "request": request}] * 32  # some seconds
+    batch = message_class("BatchRGBRenderRequest")(items=items)
+    metrics = server.running.metrics
     with pytest.raises(grpc.RpcError) as refused:
-        server.stub.render_rgb(request, timeout=0.001)
+        server.stub.batch_render_rgb(batch, timeout=0.5)
     assert refused.value.code() is grpc.StatusCode.DEADLINE_EXCEEDED
+    end_s = time.monotonic() + 60
+    while metrics.num_in_flight > 0 and time.monotonic() < end_s:
+        time.sleep(0.01)
+    statuses = metrics.facts()["methods"]["batch_render_rgb"]["by_status"]
+    # gRPC may call the request cancelled a moment before its time is up.
+    assert {"DEADLINE_EXCEEDED", "CANCELLED"} & set(statuses)
     assert server.stub.render_rgb(image_request("street", server.camera())).image_bytes
 
 
-def test_metrics_count_requests_by_status(server):
-    facts = server.running.metrics.facts()["methods"]["render_rgb"]
-    assert facts["count"] == sum(facts["by_status"].values())
-    assert facts["by_status"]["NOT_FOUND"] >= 3
-    assert 0 < facts["p50_ms"] <= facts["p90_ms"] <= facts["p99_ms"]
+def test_metrics_count_requests_by_status():
+    metrics = Metrics()
+    for milliseconds in range(1, 101):
+        metrics.begin()
+        metrics.end("render_rgb", "OK", milliseconds / 1000)
+    metrics.begin()
+    metrics.end("render_rgb", "NOT_FOUND", 60.0)
+    metrics.begin()
+    facts = metrics.facts()["methods"]["render_rgb"]
+    assert metrics.num_in_flight == 1
+    assert facts["count"] == 101
+    assert facts["by_status"] == {"NOT_FOUND": 1, "OK": 100}
+    # Percentiles of 1 to 100 ms, between two values: refusals are not counted.
+    assert [facts[f"p{n}_ms"] for n in (50, 90, 99)] == [50.5, 90.1, 99.01]
+
+
+def test_percentiles_are_those_of_the_latest_latencies():
+    metrics = Metrics()
+    for seconds in (9.0, 0.002):
+        for _ in range(NUM_LATENCIES):
+            metrics.begin()
+            metrics.end("render_rgb", "OK", seconds)
+            metrics.begin()
+            metrics.end("render_rgb", "NOT_FOUND", 1.0)
+    assert metrics.facts()["methods"]["render_rgb"]["p99_ms"] == 2.0
 
 
 # ---- The command ---------------------------------------------------------------------------------

@@ -14,40 +14,20 @@ import torch
 
 from augment.scene.cameras import Camera
 from augment.scene.lenses import FisheyeLens, FThetaLens, OpenCVLens
+from tests.lenses import F_THETA, F_THETA_CENTRE_PX
 from tools.serve.errors import RequestRefused
 from tools.serve.lens_specs import MAX_COEFFICIENTS, camera_spec, read_lens, read_out
 from tools.serve.messages import enum_numbers, message_class
 
 PINHOLE = Camera("front", 960, 740, 500.0, 510.0, 477.5, 371.25, torch.eye(4, dtype=torch.float64))
-# Of an NCore test (Apache-2.0).
-FTHETA = FThetaLens(
-    angle_to_distance=(
-        0.0,
-        473.61334228515625,
-        -9.587550163269043,
-        24.94717788696289,
-        -42.338558197021484,
-        15.140613555908203,
-    ),
-    distance_to_angle=(
-        0.0,
-        0.002108694054186344,
-        1.4248414004214283e-07,
-        -8.064807710539412e-10,
-        2.485065538765374e-12,
-        -1.7939406081105393e-15,
-    ),
-    limit_rad=1.3461724520632263,
-    linear=(0.9997570514678955, 6.27807603450492e-05, -0.00010061755892820656),
-)
 LENSES = [
     None,
     OpenCVLens(
         (-0.37, 0.2, -0.068, 0.01, 0.02, 0.003), (1.4e-3, 5.7e-4), (1e-3, 2e-4, 3e-3, -1e-4)
     ),
     FisheyeLens((0.01, -0.02, 0.003, -0.0004), 1.2),
-    FTHETA,
-    dataclasses.replace(FTHETA, reference="distance_to_angle"),
+    F_THETA,
+    dataclasses.replace(F_THETA, reference="distance_to_angle"),
 ]
 
 
@@ -66,20 +46,19 @@ def test_a_camera_survives_its_message(lens):
 
 def test_an_f_theta_pixel_is_where_the_polynomial_puts_it():
     """By hand: the principal point, plus the linear part of (r(theta), 0)."""
-    spec = camera_spec(with_lens(FTHETA))
-    spec.ftheta_param.principal_point_x = 477.8616638183594
-    spec.ftheta_param.principal_point_y = 371.405029296875
+    spec = camera_spec(with_lens(F_THETA))
+    spec.ftheta_param.principal_point_x, spec.ftheta_param.principal_point_y = F_THETA_CENTRE_PX
     numbers = read_lens(spec)
     angle = 0.9
-    distance = sum(k * angle**power for power, k in enumerate(FTHETA.angle_to_distance))
+    distance = sum(k * angle**power for power, k in enumerate(F_THETA.angle_to_distance))
     direction = np.array([[np.sin(angle), 0.0, np.cos(angle)]])
-    pixel, is_inside = numbers.lens.project(direction, with_lens(FTHETA).intrinsics)
+    pixel, is_inside = numbers.lens.project(direction, with_lens(F_THETA).intrinsics)
     assert is_inside.all()
-    c, _, e = FTHETA.linear
+    c, _, e = F_THETA.linear
     offset = pixel[0] - (PINHOLE.cx, PINHOLE.cy)
     np.testing.assert_allclose(offset, [c * distance, e * distance], rtol=0, atol=1e-9)
     # Our first pixel's centre is (0.5, 0.5), theirs (0, 0).
-    assert (numbers.cx, numbers.cy) == (477.8616638183594 + 0.5, 371.405029296875 + 0.5)
+    assert (numbers.cx - 0.5, numbers.cy - 0.5) == F_THETA_CENTRE_PX
 
 
 def test_opencv_coefficients_keep_their_order():
@@ -96,7 +75,7 @@ def test_opencv_coefficients_keep_their_order():
 
 def test_numbers_that_are_no_lens_are_refused_in_words():
     def ftheta(**changes):
-        spec = camera_spec(with_lens(FTHETA))
+        spec = camera_spec(with_lens(F_THETA))
         for name, value in changes.items():
             if isinstance(value, list):
                 del getattr(spec.ftheta_param, name)[:]

@@ -28,8 +28,8 @@ from augment.scene.sky import ConstantSky
 from tests.scenes import random_gaussians
 from tests.tools.serve_requests import EMPTY, image_request, refusal
 from tools.cli import ServeOptions
-from tools.serve.messages import Stub
-from tools.serve.server import is_loopback, served_recipes, start_service
+from tools.serve.messages import Stub, message_class
+from tools.serve.server import served_recipes, start_service
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -83,6 +83,27 @@ def test_no_more_scenes_are_open_than_allowed_and_all_are_served(tmp_path):
             answers = list(pool.map(stub.render_rgb, requests))
         assert [answer.image_bytes for answer in answers] == [images[name] for name in "abcabc"]
         assert store.num_open <= 2
+
+
+def test_one_request_may_have_images_of_more_scenes_than_are_open(tmp_path):
+    """Held together, the scenes would wait for each other's place."""
+    cameras = {name: write_scene(tmp_path / f"{name}.climategs", s) for s, name in enumerate("ab")}
+    paths = [str(tmp_path / f"{name}.climategs") for name in cameras]
+    with (
+        start(options_for(*paths, max_scenes=1)) as running,
+        grpc.insecure_channel(f"127.0.0.1:{running.port}") as channel,
+    ):
+        stub = Stub(channel)
+        requests = [image_request(name, cameras[name]) for name in "abba"]
+        items = [{"camera_name": str(n), "request": r} for n, r in enumerate(requests)]
+        batch = message_class("BatchRGBRenderRequest")(items=items)
+        answers = stub.batch_render_rgb(batch, timeout=60).items
+        assert [answer.camera_name for answer in answers] == ["0", "1", "2", "3"]
+        images = [answer.result.image_bytes for answer in answers]
+        step = message_class("AggregatedRenderRequest")(rgb_requests=requests)
+        returns = stub.render_aggregated(step, timeout=60).rgb_returns
+        assert [answer.image_bytes for answer in returns] == images
+        assert images[0] == images[3] != images[1] == images[2]
 
 
 def test_scenes_of_one_name_are_refused_unless_one_gets_another(tmp_path):
@@ -185,11 +206,6 @@ def test_files_and_addresses_that_cannot_be_used_are_refused(tmp_path):
         busy = options_for(path).model_copy(update={"port": running.port})
         with pytest.raises(ClimateGSError, match="cannot listen at 127"), start(busy):
             pass
-
-
-def test_addresses_of_this_machine_alone_are_known():
-    assert all(map(is_loopback, ("127.0.0.1", "localhost", "::1", "127.8.9.1")))
-    assert not any(map(is_loopback, ("0.0.0.0", "::", "10.0.0.1", "example.org")))
 
 
 # ---- The end -------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from recipes.errors import RecipeError
 from recipes.load import load_recipe
 from tests.tools.page_client import PageClient
 from tools.view import messages, text
-from tools.view.access import Access
+from tools.view.access import Access, is_loopback
 from tools.view.edits import create_file, rename_recipe, save_recipe, unused_path
 from tools.view.messages import FileTransferPart, FileTransferStartUpload, Uploads, read_message
 from tools.view.server import MAX_PIXELS, check_size, import_viser, serve
@@ -140,6 +140,11 @@ def test_a_connection_needs_the_token_this_machines_name_and_its_own_pages_origi
         for upgrade in (True, False):
             assert status_of(url, path, headers, upgrade=upgrade) in (400, 403), (path, headers)
     assert not pages.clients
+
+
+def test_addresses_of_this_machine_alone_are_known():
+    assert all(map(is_loopback, ("127.0.0.1", "localhost", "::1", "127.8.9.1")))
+    assert not any(map(is_loopback, ("0.0.0.0", "::", "10.0.0.1", "example.org")))
 
 
 def test_at_other_addresses_the_token_and_the_origin_are_the_rule():

@@ -23,7 +23,7 @@ from tools.serve.scene_facts import NS_PER_US, RigCamera, SceneFacts
 MAX_TIME_BEYOND_DRIVE_NS = 3600 * 10**9
 # Relative difference up to which intrinsics are those of a recorded camera.
 _SAME_INTRINSICS = 1e-9
-# Longest exposure that is believed, microseconds.
+# Longest exposure of an image, and longest spin of a sensor, that is believed, microseconds.
 _MAX_EXPOSURE_US = 1_000_000
 # Length of a camera's name, at most, characters.
 _MAX_NAME_LENGTH = 200
@@ -45,7 +45,7 @@ def requested_camera(request: Any, facts: SceneFacts, max_pixels: int) -> Camera
         RequestRefused: a field cannot be used.
     """
     spec = request.camera_intrinsics
-    width, height = _image_size(request, max_pixels)
+    width, height = _checked_size(request, max_pixels)
     name = spec.logical_id
     if len(name) > _MAX_NAME_LENGTH:
         raise invalid(
@@ -88,11 +88,16 @@ def requested_camera(request: Any, facts: SceneFacts, max_pixels: int) -> Camera
     return camera.resized(width, height)
 
 
-def _image_size(request: Any, max_pixels: int) -> tuple[int, int]:
-    """Return width and height of the requested image."""
+def image_size(request: Any) -> tuple[int, int]:
+    """Return width and height of the requested image: by default those of the camera's numbers."""
     spec = request.camera_intrinsics
-    width = request.resolution_w or spec.resolution_w
-    height = request.resolution_h or spec.resolution_h
+    return request.resolution_w or spec.resolution_w, request.resolution_h or spec.resolution_h
+
+
+def _checked_size(request: Any, max_pixels: int) -> tuple[int, int]:
+    """Return width and height of the requested image, neither 0 nor too large."""
+    spec = request.camera_intrinsics
+    width, height = image_size(request)
     if width < 1 or height < 1:
         raise invalid(f"resolution_w and resolution_h must be >= 1 pixel; got {width}x{height}")
     if width * height > max_pixels:
@@ -110,6 +115,15 @@ def _image_size(request: Any, max_pixels: int) -> tuple[int, int]:
 
 def _middle_us(request: Any, facts: SceneFacts) -> int:
     """Return the middle of the exposure, microseconds, rounded down."""
+    check_exposure(request)
+    start_us = request.frame_start_us
+    middle_us = start_us + (request.frame_end_us - start_us) // 2
+    check_time(middle_us * NS_PER_US, facts)
+    return middle_us
+
+
+def check_exposure(request: Any) -> None:
+    """Refuse an exposure, or a spin, that ends before it begins, or much later."""
     start_us = request.frame_start_us
     end_us = request.frame_end_us
     if not 0 <= end_us - start_us <= _MAX_EXPOSURE_US:
@@ -117,9 +131,6 @@ def _middle_us(request: Any, facts: SceneFacts) -> int:
             f"frame_end_us must be from frame_start_us to {_MAX_EXPOSURE_US} microseconds later; "
             f"got {start_us} and {end_us}"
         )
-    middle_us = start_us + (end_us - start_us) // 2
-    check_time(middle_us * NS_PER_US, facts)
-    return middle_us
 
 
 def check_time(timestamp_ns: int, facts: SceneFacts) -> None:

@@ -114,7 +114,10 @@ def _check_lens_views(camera: Camera) -> None:
 
 
 def check_format(request: Any) -> None:
-    """Refuse an image format that cannot be written, before the image is drawn."""
+    """Refuse an image format or quality that cannot be written, before the image is drawn."""
+    quality = request.image_quality
+    if quality != 0 and not 1 <= quality <= 100:  # NaN is refused, too
+        raise invalid(f"image_quality must be from 1 to 100, or 0 for the default; got {quality}")
     formats = enum_numbers("ImageFormat")
     names = {number: name for name, number in formats.items()}
     name = names.get(request.image_format)
@@ -142,10 +145,6 @@ def encode_for(request: Any, rgb: np.ndarray, recipe: Recipe) -> bytes:
         return np.ascontiguousarray(rgb.transpose(2, 0, 1)).tobytes()
     if request.image_format == formats["PNG"]:
         return encode_image(rgb, recipe.output.model_copy(update={"image": "png"}))
-    quality = recipe.output.jpeg_quality
-    if request.image_quality:
-        if not 1 <= request.image_quality <= 100:
-            raise invalid(f"image_quality must be from 1 to 100; got {request.image_quality}")
-        quality = round(request.image_quality)
+    quality = round(request.image_quality) or recipe.output.jpeg_quality
     changes = {"image": "jpg", "jpeg_quality": quality}
     return encode_image(rgb, recipe.output.model_copy(update=changes))

@@ -20,8 +20,8 @@ from augment.scene.labels import LidarSweep
 from augment.scene.scene import Scene
 from augment.view.weathered_sweep import weathered_sweep
 from recipes.schema import Recipe
-from tools.serve.cameras import check_time
-from tools.serve.errors import invalid, unimplemented
+from tools.serve.cameras import check_exposure, check_time
+from tools.serve.errors import unimplemented
 from tools.serve.messages import message_class
 from tools.serve.poses import pose_pair
 from tools.serve.scene_facts import NS_PER_US, SceneFacts
@@ -31,8 +31,6 @@ from tools.serve.scene_facts import NS_PER_US, SceneFacts
 MAX_DISTANCE_M = 8.0
 # Metres that count as much as a second between the request and the sweep.
 _METRES_PER_SECOND = 5.0
-# Nearest frames that are searched for a sweep.
-_NUM_FRAMES = 5
 
 
 def requested_sweep(request: Any, scene: Scene, recipe: Recipe, facts: SceneFacts) -> Any:
@@ -47,11 +45,7 @@ def requested_sweep(request: Any, scene: Scene, recipe: Recipe, facts: SceneFact
     Raises:
         RequestRefused: the scene has no sweep near the pose, or a field cannot be used.
     """
-    if not 0 <= request.frame_end_us - request.frame_start_us <= 1_000_000:
-        raise invalid(
-            f"frame_end_us must be from frame_start_us to a second later; got "
-            f"{request.frame_start_us} and {request.frame_end_us}"
-        )
+    check_exposure(request)
     timestamp_ns = request.frame_end_us * NS_PER_US
     check_time(timestamp_ns, facts)
     _, world_from_sensor = pose_pair(request.sensor_pose, "sensor_pose")
@@ -92,19 +86,16 @@ def _nearest_sweep(scene: Scene, position: Tensor, timestamp_ns: int) -> tuple[F
         seconds = abs(frame.timestamp_ns - timestamp_ns) / 1e9
         return distance_m(frame) + _METRES_PER_SECOND * seconds
 
-    frames = sorted(scene.frames, key=cost)[:_NUM_FRAMES]
-    nearest_m = distance_m(frames[0])
-    if nearest_m > MAX_DISTANCE_M:
-        raise unimplemented(
-            f"the nearest recorded sweep of scene {scene.name!r} is {nearest_m:.1f} m away from "
-            f"the pose: this server returns recorded sweeps up to {MAX_DISTANCE_M:g} m away, and "
-            f"renders none"
-        )
-    for frame in frames:
+    near_frames = [frame for frame in scene.frames if distance_m(frame) <= MAX_DISTANCE_M]
+    for frame in sorted(near_frames, key=cost):
         sweep = scene.lidar(frame.index)
-        if sweep is not None and distance_m(frame) <= MAX_DISTANCE_M:
+        if sweep is not None:
             return frame, sweep
-    raise unimplemented(f"scene {scene.name!r} has no recorded sweep near this pose")
+    raise unimplemented(
+        f"scene {scene.name!r} has no recorded sweep near this pose: the recorded path is "
+        f"{min(map(distance_m, scene.frames)):.1f} m away; this server returns recorded sweeps up "
+        f"to {MAX_DISTANCE_M:g} m away, and renders none"
+    )
 
 
 def _intensities(sweep: LidarSweep) -> np.ndarray:

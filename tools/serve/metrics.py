@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import array
 import resource
 import threading
 import time
+from collections import Counter, deque
 from typing import Any
 
 import numpy as np
@@ -20,20 +20,14 @@ class _MethodFigures:
     """Figures of one method."""
 
     def __init__(self) -> None:
-        self.count = 0
-        self.count_by_status: dict[str, int] = {}
-        self.latencies_ms = array.array("f")
+        self.count_by_status = Counter[str]()
+        self.latencies_ms = deque[float](maxlen=NUM_LATENCIES)
 
     def add(self, status: str, milliseconds: float) -> None:
         """Count a request. Latencies are those of requests that succeeded."""
-        self.count += 1
-        self.count_by_status[status] = self.count_by_status.get(status, 0) + 1
-        if status != "OK":
-            return
-        if len(self.latencies_ms) < NUM_LATENCIES:
+        self.count_by_status[status] += 1
+        if status == "OK":
             self.latencies_ms.append(milliseconds)
-        else:
-            self.latencies_ms[self.count % NUM_LATENCIES] = milliseconds
 
 
 class Metrics:
@@ -94,11 +88,11 @@ class Metrics:
 def _method_facts(figures: _MethodFigures) -> dict[str, Any]:
     """Return the figures of one method."""
     facts: dict[str, Any] = {
-        "count": figures.count,
+        "count": figures.count_by_status.total(),
         "by_status": dict(sorted(figures.count_by_status.items())),
     }
     if figures.latencies_ms:
-        values = np.percentile(np.frombuffer(figures.latencies_ms, np.float32), PERCENTILES)
+        values = np.percentile(figures.latencies_ms, PERCENTILES)
         percentiles = zip(PERCENTILES, values, strict=True)
         facts |= {f"p{number}_ms": round(float(value), 2) for number, value in percentiles}
     return facts

@@ -73,8 +73,6 @@ class OfferedRecipe:
 class OpenScene:
     """A scene that is in memory."""
 
-    name: str
-    """Name for clients."""
     scene: Scene
     """The scene."""
     recipe_by_suffix: dict[str, Recipe]
@@ -82,7 +80,7 @@ class OpenScene:
     backend: str
     """Name of the rasteriser's backend."""
     facts: SceneFacts
-    """Cameras, path and masks."""
+    """Name for clients, cameras, path and masks."""
 
 
 @dataclass(eq=False)
@@ -91,10 +89,8 @@ class _Entry:
 
     source: SceneSource
     """Its origin."""
-    name: str
-    """Name for clients."""
     facts: SceneFacts
-    """Cameras, path and masks, also while the scene is closed."""
+    """Name for clients, cameras, path and masks, also while the scene is closed."""
     open_scene: OpenScene | None = None
     """The scene, if it is in memory."""
     num_users: int = 0
@@ -111,6 +107,11 @@ def parse_source(text: str) -> SceneSource:
     if match is None or Path(text).exists():
         return SceneSource(text)
     return SceneSource(match[2], match[1])
+
+
+def scene_name(scene_id: str) -> str:
+    """Return the scene of a client's name, without the weather."""
+    return scene_id.partition(RECIPE_SIGN)[0]
 
 
 def offered_recipes(recipes: Sequence[Recipe]) -> tuple[OfferedRecipe, ...]:
@@ -226,7 +227,8 @@ class SceneStore:
 
     def _find(self, scene_id: str) -> tuple[_Entry, str]:
         """Return the entry of a client's name, and the name's part with the weather."""
-        name, sign, weather = scene_id.partition(RECIPE_SIGN)
+        name = scene_name(scene_id)
+        suffix = scene_id.removeprefix(name)
         entry = self._entry_by_name.get(name)
         if entry is None:
             raise RequestRefused(
@@ -235,21 +237,20 @@ class SceneStore:
                 f"{_listed(self.scene_names)}",
             )
         suffixes = [offered.suffix for offered in self._offered]
-        if sign + weather not in suffixes:
+        if suffix not in suffixes:
             raise RequestRefused(
                 grpc.StatusCode.NOT_FOUND,
-                f"scene {name!r} is not offered in the weather {quote_text(sign + weather)}; "
+                f"scene {name!r} is not offered in the weather {quote_text(suffix)}; "
                 f"choose from {_listed([s for s in suffixes if s])}, or name the scene alone",
             )
-        return entry, sign + weather
+        return entry, suffix
 
     def _acquire(self, entry: _Entry, check: Callable[[], None]) -> OpenScene:
         """Return the scene of an entry, opened if it was not, and count its user."""
         while True:
             with self._changed:
                 if entry.open_scene is not None:
-                    entry.num_users += 1
-                    entry.last_use = next(self._use_numbers)
+                    self._count_user(entry)
                     return entry.open_scene
             if not entry.opening.acquire(timeout=0.1):  # another request opens it
                 check()
@@ -257,11 +258,18 @@ class SceneStore:
             try:
                 if entry.open_scene is None:
                     with self._place(check):
-                        opened = self._open(entry.source, entry.name)
-                        with self._changed:
+                        opened = self._open(entry.source, entry.facts.name)
+                        with self._changed:  # used at once, or a waiting request would close it
                             entry.open_scene = opened
+                            self._count_user(entry)
+                            return opened
             finally:
                 entry.opening.release()
+
+    def _count_user(self, entry: _Entry) -> None:
+        """Count a request that uses an open scene. The caller holds the lock."""
+        entry.num_users += 1
+        entry.last_use = next(self._use_numbers)
 
     @contextlib.contextmanager
     def _place(self, check: Callable[[], None]) -> Iterator[None]:
@@ -295,7 +303,7 @@ class SceneStore:
         """Open a scene for the first time, and offer it."""
         with self._place(lambda: None):
             opened = self._open(source, source.name)
-        name = opened.name
+        name = opened.facts.name
         if name in self._entry_by_name:
             raise ClimateGSError(
                 f"two scenes are called {name!r}: {self._entry_by_name[name].source.uri} and "
@@ -307,7 +315,7 @@ class SceneStore:
                 f"{RECIPE_SIGN} and {VARIANT_SIGN} name its weather; give it another, as in "
                 f"scene1={source.uri}"
             )
-        self._entry_by_name[name] = _Entry(source, name, opened.facts, opened)
+        self._entry_by_name[name] = _Entry(source, opened.facts, opened)
 
     def _open(self, source: SceneSource, name: str | None) -> OpenScene:
         """Open a scene, choose the settings of its recipes, and compute what images share."""
@@ -335,7 +343,7 @@ class SceneStore:
         precompute_effects(JobContext(scene, recipes, None, state_folder, backend, True))
         for recipe in recipes:
             _draw_small_views(scene, recipe, backend)
-        opened = OpenScene(name, scene, recipe_by_suffix, backend, facts_of(scene, name))
+        opened = OpenScene(scene, recipe_by_suffix, backend, facts_of(scene, name))
         for problem in scene.problems:
             print_note(f"note: {problem}")
         self._on_open(opened)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import ipaddress
 import signal
 import tempfile
 import threading
@@ -19,6 +18,7 @@ from augment.render.backends import renders_on_gpu
 from recipes.schema import Recipe
 from tools.output import compiling_noted, print_note, write_json
 from tools.render import resolve_recipes
+from tools.view.access import is_loopback
 from tools.warm_up import kernel_modules, warm_up
 
 if TYPE_CHECKING:
@@ -234,14 +234,6 @@ def _read(path: Path, option: str) -> bytes:
     if b"-----BEGIN " not in data:
         raise ClimateGSError(f"{option} {path} is not a PEM file (-----BEGIN ...)")
     return data
-
-
-def is_loopback(host: str) -> bool:
-    """Return True if only programs of this machine reach an address."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def _ready_text(options: ServeOptions, running: RunningService) -> str:

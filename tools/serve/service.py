@@ -7,15 +7,17 @@ sentence. Drawing is left to `DrawingThreads`, scenes to `SceneStore`.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import math
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import grpc
 import numpy as np
@@ -31,23 +33,24 @@ from augment.scene.scene import Scene
 from recipes.errors import RecipeError
 from recipes.schema import Recipe
 from tools.serve.actors import RequestedScene, requested_scene
-from tools.serve.cameras import available_camera, has_same_intrinsics, requested_camera
+from tools.serve.cameras import available_camera, has_same_intrinsics, image_size, requested_camera
 from tools.serve.drawing import DrawingThreads, check_format, encode_for
 from tools.serve.errors import RequestEnded, RequestRefused, invalid, quote_text
 from tools.serve.lidar import requested_sweep
 from tools.serve.messages import (
     INTERFACE_VERSION,
     MAX_MESSAGE_BYTES,
-    PACKAGES,
-    SERVICE,
     Method,
     message_class,
     methods,
+    service_names,
 )
 from tools.serve.metrics import Metrics
 from tools.serve.poses import pose_message
-from tools.serve.scene_store import OpenScene, SceneStore
+from tools.serve.scene_facts import SceneFacts
+from tools.serve.scene_store import OpenScene, SceneStore, scene_name
 
+Item = TypeVar("Item")
 _LOG = logging.getLogger(__name__)
 # Pixels of all images of a batch, at most: as many as a message can hold without compression.
 MAX_BATCH_PIXELS = MAX_MESSAGE_BYTES // 3
@@ -70,8 +73,8 @@ class Call:
         self._context = context
         self.subjects: list[str] = []
         """Scenes and cameras that the request names, for the log."""
-        self.moved_scenes: dict[tuple[str, bytes], RequestedScene] = {}
-        """Scenes by name and moving objects: images of one step have the same."""
+        self.moved_scenes: dict[bytes, RequestedScene] = {}
+        """The scene in use by its moving objects: images of one step have the same."""
 
     def check(self) -> None:
         """Raise RequestEnded if nobody waits for the response any more."""
@@ -158,8 +161,7 @@ class SensorService:
             for method in methods()
         }
         return [
-            grpc.method_handlers_generic_handler(f"{package}.{SERVICE}", handler_by_name)
-            for package in PACKAGES
+            grpc.method_handlers_generic_handler(name, handler_by_name) for name in service_names()
         ]
 
     # ---- From bytes to bytes ---------------------------------------------------------------------
@@ -239,18 +241,20 @@ class SensorService:
         _check_batch([item.request for item in items])
         item_class = message_class("BatchRGBRenderReturnItem")
         response = message_class("BatchRGBRenderReturn")()
-        with contextlib.ExitStack() as stack:
-            begun_images = [self._try_to_begin(item.request, call, stack) for item in items]
-            for item, begun in zip(items, begun_images, strict=True):
-                answer = item_class(camera_name=item.camera_name)
-                try:
-                    if isinstance(begun, Exception):
-                        raise begun
-                    answer.result.CopyFrom(self._finish_image(begun))
-                    answer.success = True
-                except (ClimateGSError, RecipeError) as error:
-                    answer.error_message = str(error)[:_MAX_TEXT_LENGTH]
-                response.items.append(answer)
+        for run in _runs_of_scenes(items, lambda item: item.request):
+            call.moved_scenes.clear()
+            with contextlib.ExitStack() as stack:
+                begun_images = [self._try_to_begin(item.request, call, stack) for item in run]
+                for item, begun in zip(run, begun_images, strict=True):
+                    answer = item_class(camera_name=item.camera_name)
+                    try:
+                        if isinstance(begun, Exception):
+                            raise begun
+                        answer.result.CopyFrom(self._finish_image(begun))
+                        answer.success = True
+                    except (ClimateGSError, RecipeError) as error:
+                        answer.error_message = str(error)[:_MAX_TEXT_LENGTH]
+                    response.items.append(answer)
         return response
 
     def _render_aggregated(self, request: Any, call: Call) -> Any:
@@ -258,9 +262,11 @@ class SensorService:
         if len(request.lidar_requests) > MAX_BATCH_IMAGES:
             raise invalid(f"a request may ask for {MAX_BATCH_IMAGES} sweeps, at most")
         response = message_class("AggregatedRenderReturn")()
-        with contextlib.ExitStack() as stack:
-            pending = [self._begin_image(rgb, call, stack) for rgb in request.rgb_requests]
-            response.rgb_returns.extend(map(self._finish_image, pending))
+        for run in _runs_of_scenes(request.rgb_requests, lambda rgb: rgb):
+            call.moved_scenes.clear()
+            with contextlib.ExitStack() as stack:
+                pending = [self._begin_image(rgb, call, stack) for rgb in run]
+                response.rgb_returns.extend(map(self._finish_image, pending))
         response.lidar_returns.extend(
             self._render_lidar(lidar, call) for lidar in request.lidar_requests
         )
@@ -279,18 +285,13 @@ class SensorService:
         """Begin the image of an `RGBRenderRequest`; its scene stays open until the stack closes."""
         call.check()
         check_format(request)
-        quality = request.image_quality
-        if not (math.isfinite(quality) and 0 <= quality <= 100):
-            raise invalid(
-                f"image_quality must be from 1 to 100, or 0 for the default; got {quality}"
-            )
         facts = self._store.facts(request.scene_id)
         camera = requested_camera(request, facts, self._limits.max_pixels)
         size = f"{camera.width}x{camera.height}"
         call.subjects.append(f"{request.scene_id} {quote_text(camera.name)} {size}")
-        opened, recipe = stack.enter_context(self._store.borrow(request.scene_id, call.check))
         if request.insert_ego_mask:
-            _check_ego_mask(request, opened, camera)
+            _check_ego_mask(request, facts, camera)
+        opened, recipe = stack.enter_context(self._store.borrow(request.scene_id, call.check))
         scene = self._moved_scene(request, opened, call)
         finish = self._threads.begin_view(scene, camera, recipe, opened.backend, call.check)
         return _PendingImage(request, opened, recipe, camera, finish)
@@ -304,11 +305,11 @@ class SensorService:
             frame_end_us=request.frame_end_us,
             dynamic_objects=request.dynamic_objects,
         )
-        key = (opened.name, key_message.SerializeToString(deterministic=True))
+        key = key_message.SerializeToString(deterministic=True)
         moved = call.moved_scenes.get(key)
         if moved is None:
             moved = call.moved_scenes[key] = requested_scene(request, opened.scene)
-            self._note_unknown_tracks(opened.name, moved.unknown_tracks)
+            self._note_unknown_tracks(opened.facts.name, moved.unknown_tracks)
         return moved.scene
 
     def _note_unknown_tracks(self, scene_name: str, track_ids: Sequence[str]) -> None:
@@ -339,8 +340,7 @@ class SensorService:
 
     def _render_lidar(self, request: Any, call: Call) -> Any:
         call.check()
-        call.subjects.append(request.scene_id)
-        facts = self._store.facts(request.scene_id)
+        facts = self._named_facts(request, call)
         with self._store.borrow(request.scene_id, call.check) as (opened, recipe):
             work = self._threads.submit(
                 lambda: requested_sweep(request, opened.scene, recipe, facts)
@@ -348,6 +348,15 @@ class SensorService:
             return wait_for_result(work)
 
     # ---- Facts -----------------------------------------------------------------------------------
+
+    def _named_facts(self, request: Any, call: Call) -> SceneFacts:
+        """Return the facts of a request's scene, whose name is noted for the log.
+
+        An unknown name is in the refusal, shortened: the log gets no text of any length.
+        """
+        facts = self._store.facts(request.scene_id)
+        call.subjects.append(request.scene_id)
+        return facts
 
     def _get_version(self, request: Any, call: Call) -> Any:
         version_class = message_class("common.VersionId")
@@ -361,14 +370,12 @@ class SensorService:
         return message_class("common.AvailableScenesReturn")(scene_ids=self._store.scene_ids)
 
     def _get_available_cameras(self, request: Any, call: Call) -> Any:
-        call.subjects.append(request.scene_id)
-        facts = self._store.facts(request.scene_id)
+        facts = self._named_facts(request, call)
         cameras = [available_camera(camera) for camera in facts.cameras]
         return message_class("AvailableCamerasReturn")(available_cameras=cameras)
 
     def _get_available_trajectories(self, request: Any, call: Call) -> Any:
-        call.subjects.append(request.scene_id)
-        facts = self._store.facts(request.scene_id)
+        facts = self._named_facts(request, call)
         response = message_class("AvailableTrajectoriesReturn")()
         trajectory = response.available_trajectories.add().trajectory
         for timestamp_us, world_from_rig in facts.path:
@@ -385,17 +392,27 @@ class SensorService:
         return response
 
 
+def _runs_of_scenes(items: Iterable[Item], request_of: Callable[[Item], Any]) -> list[list[Item]]:
+    """Return images that follow each other in runs of one scene, which are drawn together.
+
+    The scene of a run is free before that of the next one is borrowed: requests that hold a scene
+    while they wait for another would wait for each other, where few scenes are open.
+
+    Args:
+        items: the images.
+        request_of: returns the `RGBRenderRequest` of an image.
+    """
+    runs = itertools.groupby(items, key=lambda item: scene_name(request_of(item).scene_id))
+    return [list(run) for _, run in runs]
+
+
 def _check_batch(requests: Any) -> None:
     """Refuse a batch whose images are too many, or too large together."""
     if len(requests) > MAX_BATCH_IMAGES:
         raise invalid(
             f"a request may ask for {MAX_BATCH_IMAGES} images, at most; got {len(requests)}"
         )
-    num_pixels = 0
-    for request in requests:
-        spec = request.camera_intrinsics
-        width = request.resolution_w or spec.resolution_w
-        num_pixels += width * (request.resolution_h or spec.resolution_h)
+    num_pixels = sum(math.prod(image_size(request)) for request in requests)
     if num_pixels > MAX_BATCH_PIXELS:
         raise invalid(
             f"the images of a request may have {MAX_BATCH_PIXELS} pixels together, at most; got "
@@ -406,10 +423,9 @@ def _check_batch(requests: Any) -> None:
 # ---- The recording car ---------------------------------------------------------------------------
 
 
-def _check_ego_mask(request: Any, opened: OpenScene, camera: Camera) -> None:
+def _check_ego_mask(request: Any, facts: SceneFacts, camera: Camera) -> None:
     """Refuse a mask of the recording car that the scene does not have."""
     mask_id = request.ego_mask_id
-    facts = opened.facts
     names = facts.masked_cameras
     if mask_id.rig_config_id == facts.name and mask_id.camera_logical_id in names:
         if mask_id.camera_logical_id != camera.name:
@@ -455,8 +471,6 @@ def _with_ego_mask(rgb: np.ndarray, scene: Scene, camera: Camera, recipe: Recipe
         frame = min(frames, key=lambda frame: abs(frame.timestamp_ns - camera.timestamp_ns))
         recorded = frame.cameras[camera.name]
         with contextlib.suppress(ImageFault):
-            from pathlib import Path
-
             path = Path(frame.image_paths[camera.name])
             photo = read_scaled(path, recorded, recorded.resized(camera.width, camera.height))
     return np.where(mask[..., None], photo, rgb)
