@@ -159,11 +159,12 @@ class SemanticMetric:
         counts = self.count(predictions)[np.asarray(numbers, np.int64)]
         names = [semantic_class.name.lower() for semantic_class in SemanticClass]
         resampled = None
-        if resampling is not None:
-            scene_numbers = resampling.scene_numbers[np.asarray(numbers, np.int64)]
-            by_scene = np.zeros((resampling.weights.shape[1], *counts.shape[1:]), np.int64)
-            np.add.at(by_scene, scene_numbers, counts)
-            sums = np.tensordot(resampling.weights, by_scene, axes=1)
+        image_resampling = _of_images(resampling, numbers)
+        if image_resampling is not None:
+            num_scenes = image_resampling.weights.shape[1]
+            by_scene = np.zeros((num_scenes, *counts.shape[1:]), np.int64)
+            np.add.at(by_scene, image_resampling.scene_numbers, counts)
+            sums = np.tensordot(image_resampling.weights, by_scene, axes=1)
             resampled = np.stack([class_overlaps(table) for table in sums])
         return mean_of_categories(class_overlaps(counts.sum(axis=0)), resampled, names)
 

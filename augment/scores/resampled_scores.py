@@ -29,6 +29,8 @@ class ResampledEffect:
     """Value on the clean renders of the scenes that count."""
     levels: Float64[np.ndarray, "L R"]
     """Value at each level, mildest first."""
+    num_scenes: int
+    """Number of scenes that count. Resamples of one scene are all alike: no interval follows."""
 
     @property
     def resilience(self) -> Resamples:
@@ -116,7 +118,9 @@ def add_intervals(
 def _with_intervals(
     effect: EffectScores, values: ResampledEffect, baseline: ResampledEffect | None
 ) -> EffectScores:
-    """Return the scores of an effect with their intervals."""
+    """Return the scores of an effect with their intervals; without any for a single scene."""
+    if values.num_scenes < 2:
+        return effect
     updates: dict[str, object] = {"resilience_interval": find_interval(values.resilience)}
     if baseline is not None:
         updates["corruption_error_interval"] = find_interval(values.corruption_error(baseline))

@@ -290,11 +290,15 @@ def _resample_images(suite: RenderedSuite) -> SceneResampling | None:
 
 
 def _resampled_values(
-    clean: MetricValue, cleans: Mapping[str, MetricValue], levels: Mapping[str, list[MetricValue]]
+    suite: RenderedSuite,
+    clean: MetricValue,
+    cleans: Mapping[str, MetricValue],
+    levels: Mapping[str, list[MetricValue]],
 ) -> ResampledValues | None:
     """Return a metric in each resample; None without resamples.
 
     Args:
+        suite: The suite.
         clean: Value on all clean renders.
         cleans: Value on the clean renders that count for each effect.
         levels: Values at the levels of each effect.
@@ -306,7 +310,8 @@ def _resampled_values(
         clean_resampled = cleans[effect].resampled
         by_level = [measured.resampled for measured in of_effect if measured.resampled is not None]
         assert clean_resampled is not None and len(by_level) == len(of_effect), "of one metric"
-        effects[effect] = ResampledEffect(clean_resampled, np.stack(by_level))
+        scenes = {suite.images[number].scene for number in suite.numbers_of(effect)}
+        effects[effect] = ResampledEffect(clean_resampled, np.stack(by_level), len(scenes))
     return ResampledValues(clean.resampled, effects)
 
 
@@ -378,7 +383,7 @@ def _make_scores(run: _Run, folder: Path) -> tuple[SuiteScores, ResampledValues 
         warnings=tuple(warnings),
         notes=tuple(_notes(run)),
     )
-    return scores, _resampled_values(clean, cleans, levels)
+    return scores, _resampled_values(suite, clean, cleans, levels)
 
 
 def _effect_scores(

@@ -95,7 +95,9 @@ def test_resampled_scores_follow_the_formulas_of_scores():
         ResampledValues(
             rng.uniform(0.5, 1, 5),
             {
-                name: ResampledEffect(rng.uniform(0.5, 1, 5), rng.uniform(0.1, 0.5, (count, 5)))
+                name: ResampledEffect(
+                    rng.uniform(0.5, 1, 5), rng.uniform(0.1, 0.5, (count, 5)), num_scenes=4
+                )
                 for name, count in (("fog", 3), ("rain", 2))
             },
         )
@@ -159,3 +161,15 @@ def test_scores_have_intervals_and_differences_those_of_pairs(tmp_path):
     assert from_json.robustness.mce == scores.robustness.mce
     assert from_json.robustness.mce_interval is None
     assert from_json.robustness.mpc_interval == scores.robustness.mpc_interval
+
+
+def test_an_effect_that_counts_in_one_scene_has_no_interval(tmp_path):
+    pytest.importorskip("pycocotools")
+    omitted = {"scene-a": ["fog"], "scene-b": ["fog"]}
+    suite = write_suite(tmp_path / "out", omitted=omitted)
+    scores = score_suite(open_store(suite.path), write_coco(tmp_path / "p", suite))
+    fog = scores.effects["fog"]
+    assert fog.resilience_interval is None
+    assert {level.metric_interval for level in fog.levels} == {None}
+    assert {level.recall_interval for level in fog.levels} == {None}
+    assert scores.clean_interval is not None  # of three scenes

@@ -12,9 +12,11 @@ import pytest
 import torch
 
 from adapters.base import open_scene
+from adapters.street.layout import StreetParameters
 from augment.errors import OutputError
 from augment.scene.semantics import SemanticClass
 from tools.bench import training
+from tools.bench.scene_images import street_uris
 from tools.bench.segmentation import (
     IGNORED_LABEL,
     TrainingSettings,
@@ -43,16 +45,15 @@ from tools.bench.training import (
     measure,
     read_views,
     render_missing,
-    street_uris,
 )
 
 SETTINGS = TrainingSettings(
     steps=2, batch=2, learning_rate=4e-3, widths=(8, 16), num_classes=len(CLASSES)
 )
-STREETS = {"frames": 1, "width": 48, "height": 32}
+STREET = StreetParameters(frames=1, width=48, height=32, gaussians=60_000)
 TINY_CASE = TrainingCase(
-    train_scenes=street_uris((0,), **STREETS),
-    test_scenes=street_uris((100,), **STREETS),
+    train_scenes=street_uris((0,), STREET),
+    test_scenes=street_uris((100,), STREET),
     frames=1,
     cameras=("front",),
     draws=1,

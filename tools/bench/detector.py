@@ -13,36 +13,29 @@ import importlib.util
 import itertools
 import json
 import multiprocessing
-import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.compute as pc
 import torch
 from tqdm import tqdm
 
 from adapters.base import open_scene, recorded_conditions
 from adapters.street.layout import StreetParameters
-from augment.dataset import WeatherDataset
 from augment.errors import ClimateGSError, OutputError
 from augment.jobs.block_worker import JobWorkerSetup
-from augment.jobs.render_job import RenderJob, SceneLoader, run_job
+from augment.jobs.render_job import SceneLoader
 from augment.output.codecs import decode_image
-from augment.output.layout import variant_name
-from augment.output.manifest import OK, read_manifest
-from augment.output.names import MANIFEST_FILE
 from augment.output.store import open_store
 from augment.scores.probe import probe
 from augment.scores.score_suite import add_baseline, score_suite
 from augment.scores.suite_facts import RenderedSuite, read_suite
 from augment.scores.suite_scores import SuiteScores
 from augment.suite.run import SuiteRun, run_suite, suite_recipes
-from recipes.files import with_digest
 from recipes.job import JobScene
 from recipes.load import parse_recipe
 from recipes.schema import Recipe
@@ -58,6 +51,13 @@ from tools.bench.detection import (
 )
 from tools.bench.detector_tables import Hits, count_hits, make_tables
 from tools.bench.harness import Figures, figures, machine_facts
+from tools.bench.scene_images import (
+    SceneImages,
+    processor_s,
+    read_samples,
+    render_images,
+    street_uris,
+)
 from tools.bench.segmentation import TrainingSettings, one_deterministic_thread
 
 SUITE = "weather-c-v1"
@@ -163,6 +163,14 @@ class DetectorCase:
         weather = [draw_recipe(kind, number) for kind in LEARNT_WEATHER for number in numbers]
         return [draw_recipe(CLEAR, 0), *weather]
 
+    @property
+    def train_images(self) -> list[SceneImages]:
+        """Return the images to learn from, of each scene."""
+        return [
+            SceneImages(uri, self.recipes_of(uri), self.train_frames, self.train_cameras)
+            for uri in self.train_scenes
+        ]
+
 
 def draw_recipe(kind: str, number: int) -> Recipe:
     """Return one draw of a kind of weather, in numbers.
@@ -175,49 +183,26 @@ def draw_recipe(kind: str, number: int) -> Recipe:
     return parse_recipe(text, source=kind, name=kind).resolve(number)
 
 
-def street_uris(
-    seeds: Sequence[int], *, frames: int, width: int, height: int, gaussians: int
-) -> tuple[str, ...]:
-    """Return URIs of busy streets through which the car drives fast, so that frames differ.
-
-    Args:
-        seeds: The seeds of the streets.
-        frames: The number of frames of each.
-        width: The width of an image, pixels.
-        height: The height of an image, pixels.
-        gaussians: The number of Gaussians of each.
-    """
-    return tuple(
-        StreetParameters(
-            seed=seed,
-            frames=frames,
-            width=width,
-            height=height,
-            speed_mps=20.0,
-            gaussians=gaussians,
-            parked=20,
-            moving=6,
-            pedestrians=6,
-            lidar_columns=16,  # no sweep is used
-            lidar_rings=2,
-        ).uri
-        for seed in seeds
-    )
-
+# A busy street.
+BUSY_STREET = StreetParameters(
+    frames=29, width=256, height=144, gaussians=100_000, parked=20, moving=6, pedestrians=6
+)
+# The street of `--quick`.
+QUICK_STREET = BUSY_STREET.model_copy(
+    update={"frames": 5, "width": 128, "height": 72, "gaussians": 60_000}
+)
 
 # The case of published figures. Frames of a street are 10 m apart, those of the suite 16 m.
 FULL_CASE = DetectorCase(
-    train_scenes=street_uris(range(6), frames=29, width=256, height=144, gaussians=100_000),
-    test_scenes=street_uris(
-        (100, 101, 102, 103, 106, 107), frames=29, width=256, height=144, gaussians=100_000
-    ),
+    train_scenes=street_uris(range(6), BUSY_STREET),
+    test_scenes=street_uris((100, 101, 102, 103, 106, 107), BUSY_STREET),
     train_frames=tuple(range(0, 29, 5)),
     test_frames="::8",
 )
 # The case of `--quick`.
 QUICK_CASE = DetectorCase(
-    train_scenes=street_uris(range(2), frames=5, width=128, height=72, gaussians=60_000),
-    test_scenes=street_uris((100, 101), frames=5, width=128, height=72, gaussians=60_000),
+    train_scenes=street_uris(range(2), QUICK_STREET),
+    test_scenes=street_uris((100, 101), QUICK_STREET),
     train_frames=(0, 4),
     test_frames="::4",
     effects=("fog", "lens"),
@@ -260,14 +245,14 @@ def measure(
     case = case or (QUICK_CASE if quick else FULL_CASE)
     with tempfile.TemporaryDirectory(prefix="climategs-bench-") as name:
         work_dir = folder or Path(name)
-        seconds = {"start": _processor_s()}
+        seconds = {"start": processor_s()}
         render_suite(case, work_dir / "suite", scene_loader)
-        seconds["suite"] = _processor_s()
-        render_training(case, work_dir / "training", scene_loader)
-        seconds["training images"] = _processor_s()
+        seconds["suite"] = processor_s()
+        render_images(case.train_images, work_dir / "training", scene_loader)
+        seconds["training images"] = processor_s()
         suite = read_suite(open_store(str(work_dir / "suite")))
         scores, hits, train_s = _train_and_score(case, suite, work_dir)
-        seconds["training and scoring"] = _processor_s()
+        seconds["training and scoring"] = processor_s()
     names = list(seconds)
     parts = {b: seconds[b] - seconds[a] for a, b in itertools.pairwise(names)}
     parts["one training"] = train_s
@@ -309,38 +294,6 @@ def render_suite(case: DetectorCase, out: Path, scene_loader: SceneLoader = open
         )
 
 
-def render_training(
-    case: DetectorCase, folder: Path, scene_loader: SceneLoader = open_scene
-) -> None:
-    """Render the images to learn from that are missing; complete scenes are not opened.
-
-    Raises:
-        OutputError: An image failed.
-    """
-    for uri in case.train_scenes:
-        recipes = case.recipes_of(uri)
-        count = len(recipes) * len(case.train_frames) * len(case.train_cameras)
-        has_rows = (folder / MANIFEST_FILE).is_file()
-        if has_rows and read_manifest(folder).filter(_rows_of(case, uri)).num_rows == count:
-            continue
-        job = RenderJob(uri, recipes, folder, case.train_frames, case.train_cameras)
-        result = run_job(job, scene_loader=scene_loader)
-        if result.failed:
-            raise OutputError(f"{uri}: {result.failed} images failed: {result.failures[0]}")
-
-
-def _rows_of(case: DetectorCase, uri: str) -> pc.Expression:
-    """Return the condition on a manifest's rows that they are finished images of a scene's case."""
-    hashes = [with_digest(recipe).hash for recipe in case.recipes_of(uri)]
-    return (
-        (pc.field("source") == uri)
-        & (pc.field("status") == OK)
-        & pc.field("recipe_hash").isin(hashes)
-        & pc.field("camera").isin([*case.train_cameras])
-        & pc.field("frame").isin([*case.train_frames])
-    )
-
-
 def read_views(case: DetectorCase, folder: Path) -> DetectionViews:
     """Return the views to learn from.
 
@@ -350,26 +303,13 @@ def read_views(case: DetectorCase, folder: Path) -> DetectionViews:
     images = list[torch.Tensor]()
     targets = []
     kinds = tuple[str, ...]()
-    for uri in case.train_scenes:
-        recipes = case.recipes_of(uri)
-        kinds = tuple(recipe.name for recipe in recipes)
-        dataset = WeatherDataset(
-            folder, where=_rows_of(case, uri), load=("image", "boxes"), image_type="uint8"
-        )
-        samples = {
-            (sample["frame"], sample["camera"]["name"], sample["variant"]): sample
-            for sample in (dataset[number] for number in range(len(dataset)))
-        }
-        for frame in case.train_frames:
-            for camera in case.train_cameras:
-                keys = [(frame, camera, variant_name(recipe)) for recipe in recipes]
-                missing_keys = [key for key in keys if key not in samples]
-                if missing_keys:
-                    raise OutputError(f"{folder} lacks an image of {uri}: {missing_keys[0]}")
-                images.append(torch.stack([samples[key]["image"] for key in keys]))
-                objects = objects_of(samples[keys[0]]["boxes"])
-                size = tuple(images[-1].shape[-2:])
-                targets.append(make_targets(objects, len(CATEGORIES), (size[0], size[1])))
+    for scene_images in case.train_images:
+        kinds = tuple(recipe.name for recipe in scene_images.recipes)
+        for samples in read_samples(scene_images, folder, "boxes"):
+            images.append(torch.stack([sample["image"] for sample in samples]))
+            objects = objects_of(samples[0]["boxes"])
+            height, width = images[-1].shape[-2:]
+            targets.append(make_targets(objects, len(CATEGORIES), (height, width)))
     return DetectionViews(torch.stack(images), kinds, stack_targets(targets))
 
 
@@ -441,9 +381,9 @@ def train_and_predict(
     views = read_views(case, work_dir / "training")
     suite = read_suite(open_store(str(work_dir / "suite")))
     with one_deterministic_thread():
-        start_s = _processor_s()
+        start_s = processor_s()
         network = train_detector(views, case.settings, kinds=ARMS[arm].kinds, seed=seed)
-        train_s = _processor_s() - start_s
+        train_s = processor_s() - start_s
         predict_suite(network, suite, folder)
     return train_s
 
@@ -480,8 +420,3 @@ def predict_suite(network: torch.nn.Module, suite: RenderedSuite, folder: Path) 
 def load_image(suite: RenderedSuite, path: str) -> np.ndarray:
     """Return an image of the suite, uint8 [H, W, 3]."""
     return decode_image(suite.store.read(path))
-
-
-def _processor_s() -> float:
-    """Return the processor time of this process so far, seconds, with that of finished children."""
-    return sum(os.times()[:4])

@@ -9,7 +9,6 @@ are rendered once into a folder; an interrupted run goes on where it was.
 from __future__ import annotations
 
 import math
-import os
 import statistics
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -17,23 +16,23 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import pyarrow.compute as pc
 import torch
 from tqdm import tqdm
 
 from adapters.base import open_scene
 from adapters.street.layout import StreetParameters
-from augment.dataset import WeatherDataset
-from augment.errors import OutputError
-from augment.jobs.render_job import RenderJob, SceneLoader, run_job
-from augment.output.layout import variant_name
-from augment.output.manifest import OK, read_manifest
-from augment.output.names import MANIFEST_FILE
+from augment.jobs.render_job import SceneLoader
 from augment.scene.semantics import SemanticClass
-from recipes.files import with_digest
 from recipes.load import parse_recipe
 from recipes.schema import Recipe
 from tools.bench.harness import Figures, Table, figures, machine_facts
+from tools.bench.scene_images import (
+    SceneImages,
+    processor_s,
+    read_samples,
+    render_images,
+    street_uris,
+)
 from tools.bench.segmentation import (
     IGNORED_LABEL,
     TrainingSettings,
@@ -227,6 +226,10 @@ class TrainingCase:
             weather = [draw_recipe(kind, number) for kind in CONDITIONS if kind != CLEAR]
         return [draw_recipe(CLEAR, 0), *weather]
 
+    def images_of(self, uri: str) -> SceneImages:
+        """Return the images of a scene."""
+        return SceneImages(uri, self.recipes_of(uri), range(self.frames), self.cameras)
+
 
 def draw_recipe(kind: str, number: int) -> Recipe:
     """Return one draw of a condition, in numbers.
@@ -239,39 +242,20 @@ def draw_recipe(kind: str, number: int) -> Recipe:
     return parse_recipe(text, source=kind, name=kind).resolve(number)
 
 
-def street_uris(seeds: Sequence[int], *, frames: int, width: int, height: int) -> tuple[str, ...]:
-    """Return URIs of small streets through which the car drives fast, so that frames differ.
-
-    Args:
-        seeds: The seeds of the streets.
-        frames: The number of frames of each.
-        width: The width of an image, pixels.
-        height: The height of an image, pixels.
-    """
-    return tuple(
-        StreetParameters(
-            seed=seed,
-            frames=frames,
-            width=width,
-            height=height,
-            speed_mps=20.0,
-            gaussians=60_000,
-            lidar_columns=16,  # no sweep is used
-            lidar_rings=2,
-        ).uri
-        for seed in seeds
-    )
-
+# A street of few Gaussians.
+SMALL_STREET = StreetParameters(frames=8, width=160, height=96, gaussians=60_000)
+# The street of `--quick`.
+QUICK_STREET = SMALL_STREET.model_copy(update={"frames": 2, "width": 96, "height": 64})
 
 # The case of published figures.
 FULL_CASE = TrainingCase(
-    train_scenes=street_uris(range(6), frames=8, width=160, height=96),
-    test_scenes=street_uris(range(100, 103), frames=8, width=160, height=96),
+    train_scenes=street_uris(range(6), SMALL_STREET),
+    test_scenes=street_uris(range(100, 103), SMALL_STREET),
 )
 # The case of `--quick`.
 QUICK_CASE = TrainingCase(
-    train_scenes=street_uris(range(2), frames=2, width=96, height=64),
-    test_scenes=street_uris((100,), frames=2, width=96, height=64),
+    train_scenes=street_uris(range(2), QUICK_STREET),
+    test_scenes=street_uris((100,), QUICK_STREET),
     frames=2,
     draws=1,
     settings=TrainingSettings(
@@ -303,17 +287,17 @@ def measure(
     case = case or (QUICK_CASE if quick else FULL_CASE)
     with tempfile.TemporaryDirectory(prefix="climategs-bench-") as name:
         images_dir = folder or Path(name)
-        start_s = _processor_s()
+        start_s = processor_s()
         num_rendered = render_missing(case, images_dir, scene_loader)
-        rendered_s = _processor_s()
+        rendered_s = processor_s()
         train_views = read_views(case, images_dir, case.train_scenes)
         test_views = read_views(case, images_dir, case.test_scenes)
-    read_s = _processor_s()
+    read_s = processor_s()
     scores = _train_and_test(case, train_views, test_views)
     seconds = {
         "rendering": rendered_s - start_s,
         "reading": read_s - rendered_s,
-        "training": _processor_s() - read_s,
+        "training": processor_s() - read_s,
     }
     _, _, _, height, width = train_views.images.shape
     num_images = train_views.labels.shape[:2].numel() + test_views.labels.shape[:2].numel()
@@ -358,36 +342,8 @@ def render_missing(case: TrainingCase, folder: Path, scene_loader: SceneLoader =
     Raises:
         OutputError: an image failed.
     """
-    num_rendered = 0
-    for uri in (*case.test_scenes, *case.train_scenes):
-        recipes = case.recipes_of(uri)
-        if _num_finished(case, folder, uri) == len(recipes) * case.frames * len(case.cameras):
-            continue
-        job = RenderJob(uri, recipes, folder, range(case.frames), case.cameras)
-        result = run_job(job, scene_loader=scene_loader)
-        if result.failed:
-            raise OutputError(f"{uri}: {result.failed} images failed: {result.failures[0]}")
-        num_rendered += result.written
-    return num_rendered
-
-
-def _rows_of(case: TrainingCase, uri: str) -> pc.Expression:
-    """Return the condition on a manifest's rows that they are finished images of a scene's case."""
-    hashes = [with_digest(recipe).hash for recipe in case.recipes_of(uri)]
-    return (
-        (pc.field("source") == uri)
-        & (pc.field("status") == OK)
-        & pc.field("recipe_hash").isin(hashes)
-        & pc.field("camera").isin([*case.cameras])
-        & (pc.field("frame") < case.frames)
-    )
-
-
-def _num_finished(case: TrainingCase, folder: Path, uri: str) -> int:
-    """Return the number of images of a scene that the folder holds."""
-    if not (folder / MANIFEST_FILE).is_file():
-        return 0
-    return read_manifest(folder).filter(_rows_of(case, uri)).num_rows
+    scenes = (case.images_of(uri) for uri in (*case.test_scenes, *case.train_scenes))
+    return render_images(scenes, folder, scene_loader)
 
 
 def read_views(case: TrainingCase, folder: Path, uris: Sequence[str]) -> Views:
@@ -405,23 +361,11 @@ def read_views(case: TrainingCase, folder: Path, uris: Sequence[str]) -> Views:
     labels = list[torch.Tensor]()
     kinds = tuple[str, ...]()
     for uri in uris:
-        recipes = case.recipes_of(uri)
-        kinds = tuple(recipe.name for recipe in recipes)
-        dataset = WeatherDataset(
-            folder, where=_rows_of(case, uri), load=("image", "semantic"), image_type="uint8"
-        )
-        samples = {
-            (sample["frame"], sample["camera"]["name"], sample["variant"]): sample
-            for sample in (dataset[number] for number in range(len(dataset)))
-        }
-        for frame in range(case.frames):
-            for camera in case.cameras:
-                keys = [(frame, camera, variant_name(recipe)) for recipe in recipes]
-                missing_keys = [key for key in keys if key not in samples]
-                if missing_keys:
-                    raise OutputError(f"{folder} lacks an image of {uri}: {missing_keys[0]}")
-                images.append(torch.stack([samples[key]["image"] for key in keys]))
-                labels.append(torch.stack([samples[key]["semantic"] for key in keys]))
+        scene_images = case.images_of(uri)
+        kinds = tuple(recipe.name for recipe in scene_images.recipes)
+        for samples in read_samples(scene_images, folder, "semantic"):
+            images.append(torch.stack([sample["image"] for sample in samples]))
+            labels.append(torch.stack([sample["semantic"] for sample in samples]))
     return Views(torch.stack(images), class_indices(torch.stack(labels)), kinds)
 
 
@@ -497,8 +441,3 @@ def spread_text(shares: Sequence[float]) -> str:
         return ""
     percents = [100 * share for share in shares]
     return f"{statistics.fmean(percents):.1f} ({min(percents):.1f} to {max(percents):.1f})"
-
-
-def _processor_s() -> float:
-    """Return the processor time of this process so far, seconds, with that of finished children."""
-    return sum(os.times()[:4])
