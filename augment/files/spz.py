@@ -49,6 +49,7 @@ _TABLE_OFFSET = struct.Struct("<I12x")  # the rest of a header of version 4: whe
 _RECORD = struct.Struct("<II")  # type and bytes of a record of vendors
 _SIZES = struct.Struct("<QQ")  # packed and unpacked bytes of a stream, an entry of the table
 _AXES_RECORD = 0xADBE0003  # type of Adobe's record of the axes that the file has
+_AXES_BYTES = 4  # bytes of the number in that record
 # Names of axes by their number in that record; the letters are the directions of x, y and z.
 _AXES = (
     *("RUB", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
@@ -58,6 +59,7 @@ _MAX_RECORDS_BYTES = 1 << 20  # bytes of all records of vendors
 WRITTEN_VERSION = 3  # the version that is written
 _ANTIALIASED_FLAG = 0x1  # set if the splats were trained for an antialiasing renderer
 _EXTENSIONS_FLAG = 0x2  # set if there are records of vendors
+_READ_ERRORS = (OSError, EOFError, zlib.error, struct.error)  # errors of damaged files
 _MAX_DEFLATE_RATIO = 1032  # unpacked bytes for one packed byte (zlib's technical details)
 _PIECE_BYTES = 1 << 22  # bytes that are unpacked together
 _NUM_SH_REST = {
@@ -103,13 +105,20 @@ class _Header(NamedTuple):
         }
 
 
+class _Start(NamedTuple):
+    """The part of a .spz file before its columns."""
+
+    header: _Header
+    up: str  # the axis that points up
+    problems: tuple[str, ...]  # one sentence about each thing that is left out
+    stream: BinaryIO | gzip.GzipFile  # the file, unpacked up to version 3, behind that part
+
+
 class SpzContent(NamedTuple):
-    """The content of a .spz file, and the facts of its header."""
+    """The content of a .spz file."""
 
     gaussians: Gaussians  # in the file's axes, also those that cannot be rendered
     up: str  # the axis that points up
-    version: int
-    is_antialiased: bool  # True if the splats were trained for an antialiasing renderer
     problems: tuple[str, ...]  # one sentence about each thing that was left out
 
 
@@ -138,36 +147,44 @@ def read_spz_stream(file: BinaryIO, num_bytes: int, where: str) -> SpzContent:
     Raises:
         SceneError: as `read_spz`.
     """
-    up = UP
-    problems: tuple[str, ...] = ()
-    start = file.read(8)
-    file.seek(0)
     try:
-        if start.startswith(_MARK) and int.from_bytes(start[4:8], "little") > 3:
-            header = _check_header(where, file.read(_HEADER.size), num_bytes)
-            up, problems = _read_records(where, file, header)
+        start = _read_start(file, num_bytes, where)
+        header = start.header
+        if header.version > 3:
             columns = _read_streams(where, file, header, num_bytes)
         else:
-            stream = file if start.startswith(_MARK) else gzip.GzipFile(fileobj=file)
-            header = _check_header(where, stream.read(_HEADER.size), num_bytes)
-            if header.version > 3:
-                raise SceneError(
-                    f"{where}: a .spz of version {header.version} inside a gzip stream, which only "
-                    "versions 1 to 3 are; unpack it with gunzip, or export it again"
-                )
             columns = {
-                name: _read_column(where, stream, header.num, *kind)
+                name: _read_column(where, start.stream, header.num, *kind)
                 for name, kind in header.columns.items()
             }
-    except (OSError, EOFError, zlib.error, struct.error) as error:
+    except _READ_ERRORS as error:
         raise SceneError(
             f"{where}: not a whole .spz file ({error}); copy or export it again"
         ) from error
-    gaussians = _decode_gaussians(header, columns)
+    return SpzContent(_decode_gaussians(header, columns), start.up, start.problems)
+
+
+def _read_start(file: BinaryIO, num_bytes: int, where: str) -> _Start:
+    """Read and check what stands before the columns; arguments as of `read_spz_stream`."""
+    mark = file.read(8)
+    file.seek(0)
+    up = UP
+    problems: tuple[str, ...] = ()
+    if mark.startswith(_MARK) and int.from_bytes(mark[4:8], "little") > 3:
+        stream = file
+        header = _check_header(where, stream.read(_HEADER.size), num_bytes)
+        up, problems = _read_records(where, file, header)
+    else:
+        stream = file if mark.startswith(_MARK) else gzip.GzipFile(fileobj=file)
+        header = _check_header(where, stream.read(_HEADER.size), num_bytes)
+        if header.version > 3:
+            raise SceneError(
+                f"{where}: a .spz of version {header.version} inside a gzip stream, which only "
+                "versions 1 to 3 are; unpack it with gunzip, or export it again"
+            )
     if header.degree == 4:
         problems = (*problems, f"{where}: spherical harmonics of degree 4 are cut off at 3")
-    is_antialiased = bool(header.flags & _ANTIALIASED_FLAG)
-    return SpzContent(gaussians, up, header.version, is_antialiased, problems)
+    return _Start(header, up, problems, stream)
 
 
 def _read_records(where: str, file: BinaryIO, header: _Header) -> tuple[str, tuple[str, ...]]:
@@ -192,7 +209,7 @@ def _read_records(where: str, file: BinaryIO, header: _Header) -> tuple[str, tup
         if offset > len(records):
             raise SceneError(f"{where}: a record of vendors, {kind:#x}, ends behind all of them")
         if kind == _AXES_RECORD:
-            up = _up_of_axes(where, int.from_bytes(payload, "little"))
+            up = _up_of_axes(where, int.from_bytes(payload[:_AXES_BYTES], "little"))
         else:
             unknown_types.append(f"{kind:#x}")
     if not unknown_types:
@@ -452,13 +469,14 @@ def _encode_sh(sh: np.ndarray) -> np.ndarray:
 def describe_spz(path: Path) -> FileFacts:
     """Return the facts of a .spz's header."""
     with path.open("rb") as file:
-        content = read_spz_stream(file, path.stat().st_size, str(path))
+        start = _read_start(file, path.stat().st_size, str(path))
     warnings = []
-    if content.is_antialiased:
+    if start.header.flags & _ANTIALIASED_FLAG:
         warnings.append(ANTIALIASED_WARNING)
-    if content.up != UP:
+    if start.up != UP:
         warnings.append(f"its axes are stated by Adobe's record: viewers that skip it take {UP} up")
-    return FileFacts(version=f"version {content.version}", up=content.up, warnings=tuple(warnings))
+    version = f"version {start.header.version}"
+    return FileFacts(version=version, up=start.up, warnings=tuple(warnings))
 
 
 SPZ = SplatFormat(
