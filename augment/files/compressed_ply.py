@@ -19,7 +19,7 @@ import torch
 
 from augment.errors import SceneError
 from augment.files.ply import PlyHeader, describe_ply_header, iterate_rows, read_ply_header
-from augment.files.splat_format import SplatFile, SplatFormat
+from augment.files.splat_format import SplatFile, SplatFormat, insert_omitted_component
 from augment.render.sh import SH_C0
 from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
 
@@ -185,13 +185,7 @@ def _decode_quats(codes: np.ndarray) -> np.ndarray:
     squares = sum(value * value for value in values)
     largest_value = np.sqrt(np.maximum(np.float32(0), np.float32(1) - squares))
     largest = (codes >> np.uint32(30)).astype(np.uint8)
-    quats = np.empty((len(codes), 4), np.float32)
-    for component in range(4):
-        lower = values[max(component - 1, 0)]
-        same = values[min(component, 2)]
-        other = np.where(largest > component, same, lower)
-        quats[:, component] = np.where(largest == component, largest_value, other)
-    return quats
+    return np.stack(insert_omitted_component(values, largest, largest_value), axis=1)
 
 
 def _decode_sh(rows: np.ndarray, num_terms: int) -> np.ndarray:

@@ -467,7 +467,6 @@ class _File:
             raise self.error(f"{', '.join(view.extensions)} is not read; export without")
         data = self.buffer(view.buffer)
         dtype = np.dtype(_TYPES[accessor.componentType])
-        width = 0
         width = _WIDTHS[kind]
         size = width * dtype.itemsize
         stride = view.byteStride or size

@@ -30,11 +30,13 @@ from augment.errors import SceneError
 from augment.files.limits import check_memory, row_slices
 from augment.files.splat_format import (
     ANTIALIASED_WARNING,
+    OTHER_COMPONENTS,
     FileFacts,
     Loss,
     SplatFile,
     SplatFormat,
     SplatWriter,
+    insert_omitted_component,
     rotate_z_to_y,
 )
 from augment.output.atomic import write_file_atomically
@@ -364,8 +366,8 @@ def _decode_means(header: _Header, column: np.ndarray) -> np.ndarray:
 
 def _decode_quats(header: _Header, column: np.ndarray) -> np.ndarray:
     """Decode rotations, float32 [N, 4], wxyz; the file's order is xyzw."""
-    wxyz = np.empty((len(column), 4), np.float32)
     if header.version < 3:
+        wxyz = np.empty((len(column), 4), np.float32)
         xyz = column / 127.5 - 1
         wxyz[:, 1:] = xyz
         wxyz[:, 0] = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(axis=1)))
@@ -383,18 +385,8 @@ def _decode_quats(header: _Header, column: np.ndarray) -> np.ndarray:
     omitted_value = np.sqrt(np.maximum(0, 1 - first_square)).astype(np.float32)
     values = [value_of_code.astype(np.float32)[code] for code in codes]
     omitted_index = (packed >> np.uint32(30)).astype(np.uint8)
-    for component in range(4):  # x, y, z, w
-        lower = values[max(component - 1, 0)]
-        same = values[min(component, 2)]
-        other = np.where(omitted_index > component, same, lower)
-        wxyz[:, (component + 1) % 4] = np.where(omitted_index == component, omitted_value, other)
-    return wxyz
-
-
-def _other_components(component: np.ndarray) -> np.ndarray:
-    """Return the three other components of each given one, [N, 3], in order."""
-    table = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-    return table[component]
+    x, y, z, w = insert_omitted_component(values, omitted_index, omitted_value)
+    return np.stack([w, x, y, z], axis=1)
 
 
 def write_spz(path: str | Path, gaussians: Gaussians) -> None:
@@ -449,7 +441,7 @@ def _encode_quats(wxyz: np.ndarray) -> np.ndarray:
     largest = np.abs(xyzw).argmax(axis=1)
     packed = largest.astype(np.uint32)
     is_flipped = xyzw[rows, largest] < 0
-    for component in _other_components(largest).T:
+    for component in OTHER_COMPONENTS[largest].T:
         value = xyzw[rows, component]
         magnitude = np.rint(_STEPS_PER_UNIT * np.abs(value)).clip(0, 511).astype(np.uint32)
         is_negative = ((value < 0) ^ is_flipped).astype(np.uint32)
