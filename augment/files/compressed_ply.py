@@ -81,7 +81,8 @@ def read_compressed_ply(path: str | Path) -> SplatFile:
         for axis, (shift, bits) in enumerate(_RANGE_BITS):
             for codes, name, values in ((position, "position", means), (scale, "scale", scales)):
                 values[rows, axis] = _in_range(codes, shift, bits, ranges[name], axis, chunks)
-        np.exp(scales[rows], out=scales[rows])
+        with np.errstate(over="ignore"):  # infinite scales are left out later
+            np.exp(scales[rows], out=scales[rows])
         for channel, shift in enumerate(_COLOUR_SHIFTS):
             rgb = _in_range(color, shift, 8, ranges["color"], channel, chunks)
             sh[rows, 0, channel] = (rgb - np.float32(0.5)) / np.float32(SH_C0)
