@@ -133,6 +133,8 @@ def _read_zip(
     entries = {entry.filename.partition("/")[2]: entry for entry in archive.infolist()}
     if "data.pkl" not in entries or len(entries) != len(archive.infolist()):
         raise PickleError("it is no whole checkpoint of torch (no data.pkl, or several)")
+    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries.values()):
+        raise PickleError("it is compressed, as torch saves nothing")
     if "byteorder" in entries and archive.read(entries["byteorder"]) != b"little":
         raise PickleError("it was saved on a machine of another byte order")
 
@@ -147,8 +149,8 @@ def _locate_in_zip(
 ) -> tuple[int, int]:
     """Return the offset of a storage's numbers in the file, and their size in bytes."""
     entry = entries.get(f"data/{key}")
-    if entry is None or entry.compress_type != zipfile.ZIP_STORED:
-        raise PickleError(f"it lacks the numbers of storage {key}, or has them compressed")
+    if entry is None:
+        raise PickleError(f"it lacks the numbers of storage {key}")
     lengths = struct.unpack_from("<HH", content, entry.header_offset + 26)
     return entry.header_offset + 30 + sum(lengths), entry.file_size
 
@@ -306,14 +308,15 @@ class SettingsRecord(Record):
         self.state = state
 
     def setting(self, *names: str) -> Any:
-        """Return the value under these names; None if there is none."""
+        """Return the text or number under these names; None if there is none."""
         node: Any = self
         for name in names:
             state = node.state if isinstance(node, SettingsRecord) else None
             content = state.get("_content") if isinstance(state, dict) else None
             node = content.get(name) if isinstance(content, dict) else None
         state = node.state if isinstance(node, SettingsRecord) else None
-        return state.get("_val") if isinstance(state, dict) else None
+        value = state.get("_val") if isinstance(state, dict) else None
+        return value if isinstance(value, str | int | float) else None
 
 
 class _NamesWithSettings(dict[tuple[str, str], Callable[..., Any]]):

@@ -19,7 +19,7 @@ import torch
 
 from augment.errors import SceneError
 from augment.files.ply import PlyHeader, describe_ply_header, iterate_rows, read_ply_header
-from augment.files.splat_format import SplatFile, SplatFormat
+from augment.files.splat_format import SplatFile, SplatFormat, insert_omitted_component
 from augment.render.sh import SH_C0
 from augment.scene.scene import NUM_SH_BY_DEGREE, Gaussians, check_gaussians
 
@@ -81,7 +81,8 @@ def read_compressed_ply(path: str | Path) -> SplatFile:
         for axis, (shift, bits) in enumerate(_RANGE_BITS):
             for codes, name, values in ((position, "position", means), (scale, "scale", scales)):
                 values[rows, axis] = _in_range(codes, shift, bits, ranges[name], axis, chunks)
-        np.exp(scales[rows], out=scales[rows])
+        with np.errstate(over="ignore"):  # infinite scales are left out later
+            np.exp(scales[rows], out=scales[rows])
         for channel, shift in enumerate(_COLOUR_SHIFTS):
             rgb = _in_range(color, shift, 8, ranges["color"], channel, chunks)
             sh[rows, 0, channel] = (rgb - np.float32(0.5)) / np.float32(SH_C0)
@@ -185,13 +186,7 @@ def _decode_quats(codes: np.ndarray) -> np.ndarray:
     squares = sum(value * value for value in values)
     largest_value = np.sqrt(np.maximum(np.float32(0), np.float32(1) - squares))
     largest = (codes >> np.uint32(30)).astype(np.uint8)
-    quats = np.empty((len(codes), 4), np.float32)
-    for component in range(4):
-        lower = values[max(component - 1, 0)]
-        same = values[min(component, 2)]
-        other = np.where(largest > component, same, lower)
-        quats[:, component] = np.where(largest == component, largest_value, other)
-    return quats
+    return np.stack(insert_omitted_component(values, largest, largest_value), axis=1)
 
 
 def _decode_sh(rows: np.ndarray, num_terms: int) -> np.ndarray:

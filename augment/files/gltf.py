@@ -467,7 +467,6 @@ class _File:
             raise self.error(f"{', '.join(view.extensions)} is not read; export without")
         data = self.buffer(view.buffer)
         dtype = np.dtype(_TYPES[accessor.componentType])
-        width = 0
         width = _WIDTHS[kind]
         size = width * dtype.itemsize
         stride = view.byteStride or size
@@ -505,7 +504,7 @@ class _File:
                 if not head.endswith(";base64"):
                     raise binascii.Error("its data URI is not base64")
                 return np.frombuffer(base64.b64decode(text, validate=True), np.uint8)
-            except binascii.Error as error:
+            except ValueError as error:  # binascii's, or letters beyond ASCII
                 raise self.error(f"a buffer's data cannot be read: {error}") from error
         root = self.path.parent.resolve()
         file = root / unquote(uri)

@@ -31,9 +31,9 @@ _SECTION_HEADER_BYTES = 1024  # bytes of each section's header
 # that have room, Gaussians, compression level, centre, least and greatest coefficient.
 _HEADER = struct.Struct("<BBxxIIIIHxx12xff")
 # Fields of a section's header: Gaussians, Gaussians that have room, Gaussians and number of full
-# buckets, their edge, bytes of a bucket, steps of half an edge, bytes of the section, full and
-# partly filled buckets, degree of the spherical harmonics.
-_SECTION = struct.Struct("<IIIIfHxxIIIIH")
+# buckets, their edge, bytes of a bucket, steps of half an edge, bytes of the section (unused), full
+# and partly filled buckets, degree of the spherical harmonics.
+_SECTION = struct.Struct("<IIIIfHxxI4xIIH")
 _MAX_SECTIONS = 10_000  # sections of a file
 _NUM_TERMS = (0, 3, 8)  # coefficients a channel beyond the first, by degree
 _BANDS = ((0, 3), (3, 8))  # first and last of these coefficients in each band
@@ -54,7 +54,6 @@ class _Section(NamedTuple):
     bucket_edge: float  # in the file's unit
     bucket_bytes: int  # bytes of a bucket's centre
     num_steps: int  # steps of half a bucket's edge; 0 for the default
-    num_bytes: int  # bytes of the section, as stated; unused
     num_full_buckets: int
     num_partial_buckets: int
     degree: int  # of the spherical harmonics
@@ -89,9 +88,10 @@ def read_ksplat(path: str | Path) -> SplatFile:
             sh=torch.zeros(num, num_sh, 3),
         )
         start = 0
-        for section in sections:
-            _read_section(path, file, layout, section, all_gaussians, start)
-            start += section.num
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite values are left out later
+            for section in sections:
+                _read_section(path, file, layout, section, all_gaussians, start)
+                start += section.num
     gaussians, problems = check_gaussians(all_gaussians, where=str(path))
     return SplatFile(gaussians, problems=problems)
 

@@ -45,6 +45,7 @@ from augment.files.sog_meta import (
 )
 from augment.files.splat_format import (
     ANTIALIASED_WARNING,
+    OTHER_COMPONENTS,
     FileFacts,
     Loss,
     SplatFile,
@@ -269,14 +270,11 @@ def _decode_quats(pixels: np.ndarray) -> np.ndarray:
     is_valid = largest >= 0
     largest = largest.clip(0)
     np.put_along_axis(
-        quats, _OTHER_COMPONENTS[largest], (pixels[:, :3] / 255 - 0.5) * np.sqrt(2), axis=1
+        quats, OTHER_COMPONENTS[largest], (pixels[:, :3] / 255 - 0.5) * np.sqrt(2), axis=1
     )
     largest_value = np.sqrt(np.maximum(0, 1 - (quats**2).sum(axis=1)))
     quats[np.arange(len(quats)), largest] = largest_value
     return np.where(is_valid[:, None], quats, 0).astype(np.float32)
-
-
-_OTHER_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
 class _PaletteEntries(NamedTuple):
@@ -448,7 +446,7 @@ def _encode_quats(wxyz: np.ndarray) -> np.ndarray:
     quats = wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)
     largest = np.abs(quats).argmax(axis=1)[:, None]
     quats *= np.copysign(1, np.take_along_axis(quats, largest, axis=1))
-    small_values = np.take_along_axis(quats, _OTHER_COMPONENTS[largest[:, 0]], axis=1)
+    small_values = np.take_along_axis(quats, OTHER_COMPONENTS[largest[:, 0]], axis=1)
     steps = np.rint((small_values / np.sqrt(2) + 0.5) * 255).clip(0, 255)
     return np.concatenate([steps, 252 + largest], axis=1).astype(np.uint8)
 

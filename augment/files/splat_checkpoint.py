@@ -187,8 +187,9 @@ def describe_checkpoint(path: Path) -> FileFacts:
     except AdapterError as error:
         raise SceneError(str(error)) from None
     step = content.get("step", content.get("global_step"))
+    is_stated = type(step) is int and step > 0
     writer = "gsplat" if "splats" in content else "3DGRUT"
-    return FileFacts(version="PyTorch", writer=f"{writer}, step {step}" if step else writer)
+    return FileFacts(version="PyTorch", writer=f"{writer}, step {step}" if is_stated else writer)
 
 
 CHECKPOINT = SplatFormat(

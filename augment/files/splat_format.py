@@ -21,6 +21,8 @@ from augment.scene.transform import transform_gaussians_rigidly
 # Distance from zero, metres, from which coordinates are recentred: float32 resolves 0.06 mm at
 # 1 km, and 0.25 m at UTM's 4000 km.
 RECENTRE_BEYOND_M = 1000.0
+# The other three components of a rotation, in order, by the place of the largest one.
+OTHER_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 _MAX_COORDINATE_M = 1e15  # beyond, float64 has no decimetres
 
 
@@ -123,6 +125,25 @@ def rotate_z_to_y(gaussians: Gaussians) -> Gaussians:
     """Return Gaussians with z up as Gaussians with y up."""
     z_to_y = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
     return transform_gaussians_rigidly(gaussians, z_to_y, torch.zeros(3, dtype=torch.float64))
+
+
+def insert_omitted_component(
+    values: Sequence[np.ndarray], omitted_index: np.ndarray, omitted_value: np.ndarray
+) -> list[np.ndarray]:
+    """Return the four components, [N] each, of rotations that are stored without the largest one.
+
+    Args:
+        values: the three stored components in order, [N] each.
+        omitted_index: the place of the omitted component among the four, 0 to 3, [N].
+        omitted_value: the omitted component, [N].
+    """
+    components = []
+    for component in range(4):
+        lower = values[max(component - 1, 0)]
+        same = values[min(component, 2)]
+        other = np.where(omitted_index > component, same, lower)
+        components.append(np.where(omitted_index == component, omitted_value, other))
+    return components
 
 
 def recentring_origin(points: Float[np.ndarray, "N 3"]) -> np.ndarray:

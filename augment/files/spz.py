@@ -30,11 +30,13 @@ from augment.errors import SceneError
 from augment.files.limits import check_memory, row_slices
 from augment.files.splat_format import (
     ANTIALIASED_WARNING,
+    OTHER_COMPONENTS,
     FileFacts,
     Loss,
     SplatFile,
     SplatFormat,
     SplatWriter,
+    insert_omitted_component,
     rotate_z_to_y,
 )
 from augment.output.atomic import write_file_atomically
@@ -49,6 +51,7 @@ _TABLE_OFFSET = struct.Struct("<I12x")  # the rest of a header of version 4: whe
 _RECORD = struct.Struct("<II")  # type and bytes of a record of vendors
 _SIZES = struct.Struct("<QQ")  # packed and unpacked bytes of a stream, an entry of the table
 _AXES_RECORD = 0xADBE0003  # type of Adobe's record of the axes that the file has
+_AXES_BYTES = 4  # bytes of the number in that record
 # Names of axes by their number in that record; the letters are the directions of x, y and z.
 _AXES = (
     *("RUB", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
@@ -58,6 +61,7 @@ _MAX_RECORDS_BYTES = 1 << 20  # bytes of all records of vendors
 WRITTEN_VERSION = 3  # the version that is written
 _ANTIALIASED_FLAG = 0x1  # set if the splats were trained for an antialiasing renderer
 _EXTENSIONS_FLAG = 0x2  # set if there are records of vendors
+_READ_ERRORS = (OSError, EOFError, zlib.error, struct.error)  # errors of damaged files
 _MAX_DEFLATE_RATIO = 1032  # unpacked bytes for one packed byte (zlib's technical details)
 _PIECE_BYTES = 1 << 22  # bytes that are unpacked together
 _NUM_SH_REST = {
@@ -103,13 +107,20 @@ class _Header(NamedTuple):
         }
 
 
+class _Start(NamedTuple):
+    """The part of a .spz file before its columns."""
+
+    header: _Header
+    up: str  # the axis that points up
+    problems: tuple[str, ...]  # one sentence about each thing that is left out
+    stream: BinaryIO | gzip.GzipFile  # the file, unpacked up to version 3, behind that part
+
+
 class SpzContent(NamedTuple):
-    """The content of a .spz file, and the facts of its header."""
+    """The content of a .spz file."""
 
     gaussians: Gaussians  # in the file's axes, also those that cannot be rendered
     up: str  # the axis that points up
-    version: int
-    is_antialiased: bool  # True if the splats were trained for an antialiasing renderer
     problems: tuple[str, ...]  # one sentence about each thing that was left out
 
 
@@ -138,36 +149,44 @@ def read_spz_stream(file: BinaryIO, num_bytes: int, where: str) -> SpzContent:
     Raises:
         SceneError: as `read_spz`.
     """
-    up = UP
-    problems: tuple[str, ...] = ()
-    start = file.read(8)
-    file.seek(0)
     try:
-        if start.startswith(_MARK) and int.from_bytes(start[4:8], "little") > 3:
-            header = _check_header(where, file.read(_HEADER.size), num_bytes)
-            up, problems = _read_records(where, file, header)
+        start = _read_start(file, num_bytes, where)
+        header = start.header
+        if header.version > 3:
             columns = _read_streams(where, file, header, num_bytes)
         else:
-            stream = file if start.startswith(_MARK) else gzip.GzipFile(fileobj=file)
-            header = _check_header(where, stream.read(_HEADER.size), num_bytes)
-            if header.version > 3:
-                raise SceneError(
-                    f"{where}: a .spz of version {header.version} inside a gzip stream, which only "
-                    "versions 1 to 3 are; unpack it with gunzip, or export it again"
-                )
             columns = {
-                name: _read_column(where, stream, header.num, *kind)
+                name: _read_column(where, start.stream, header.num, *kind)
                 for name, kind in header.columns.items()
             }
-    except (OSError, EOFError, zlib.error, struct.error) as error:
+    except _READ_ERRORS as error:
         raise SceneError(
             f"{where}: not a whole .spz file ({error}); copy or export it again"
         ) from error
-    gaussians = _decode_gaussians(header, columns)
+    return SpzContent(_decode_gaussians(header, columns), start.up, start.problems)
+
+
+def _read_start(file: BinaryIO, num_bytes: int, where: str) -> _Start:
+    """Read and check what stands before the columns; arguments as of `read_spz_stream`."""
+    mark = file.read(8)
+    file.seek(0)
+    up = UP
+    problems: tuple[str, ...] = ()
+    if mark.startswith(_MARK) and int.from_bytes(mark[4:8], "little") > 3:
+        stream = file
+        header = _check_header(where, stream.read(_HEADER.size), num_bytes)
+        up, problems = _read_records(where, file, header)
+    else:
+        stream = file if mark.startswith(_MARK) else gzip.GzipFile(fileobj=file)
+        header = _check_header(where, stream.read(_HEADER.size), num_bytes)
+        if header.version > 3:
+            raise SceneError(
+                f"{where}: a .spz of version {header.version} inside a gzip stream, which only "
+                "versions 1 to 3 are; unpack it with gunzip, or export it again"
+            )
     if header.degree == 4:
         problems = (*problems, f"{where}: spherical harmonics of degree 4 are cut off at 3")
-    is_antialiased = bool(header.flags & _ANTIALIASED_FLAG)
-    return SpzContent(gaussians, up, header.version, is_antialiased, problems)
+    return _Start(header, up, problems, stream)
 
 
 def _read_records(where: str, file: BinaryIO, header: _Header) -> tuple[str, tuple[str, ...]]:
@@ -192,7 +211,7 @@ def _read_records(where: str, file: BinaryIO, header: _Header) -> tuple[str, tup
         if offset > len(records):
             raise SceneError(f"{where}: a record of vendors, {kind:#x}, ends behind all of them")
         if kind == _AXES_RECORD:
-            up = _up_of_axes(where, int.from_bytes(payload, "little"))
+            up = _up_of_axes(where, int.from_bytes(payload[:_AXES_BYTES], "little"))
         else:
             unknown_types.append(f"{kind:#x}")
     if not unknown_types:
@@ -347,8 +366,8 @@ def _decode_means(header: _Header, column: np.ndarray) -> np.ndarray:
 
 def _decode_quats(header: _Header, column: np.ndarray) -> np.ndarray:
     """Decode rotations, float32 [N, 4], wxyz; the file's order is xyzw."""
-    wxyz = np.empty((len(column), 4), np.float32)
     if header.version < 3:
+        wxyz = np.empty((len(column), 4), np.float32)
         xyz = column / 127.5 - 1
         wxyz[:, 1:] = xyz
         wxyz[:, 0] = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(axis=1)))
@@ -366,18 +385,8 @@ def _decode_quats(header: _Header, column: np.ndarray) -> np.ndarray:
     omitted_value = np.sqrt(np.maximum(0, 1 - first_square)).astype(np.float32)
     values = [value_of_code.astype(np.float32)[code] for code in codes]
     omitted_index = (packed >> np.uint32(30)).astype(np.uint8)
-    for component in range(4):  # x, y, z, w
-        lower = values[max(component - 1, 0)]
-        same = values[min(component, 2)]
-        other = np.where(omitted_index > component, same, lower)
-        wxyz[:, (component + 1) % 4] = np.where(omitted_index == component, omitted_value, other)
-    return wxyz
-
-
-def _other_components(component: np.ndarray) -> np.ndarray:
-    """Return the three other components of each given one, [N, 3], in order."""
-    table = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-    return table[component]
+    x, y, z, w = insert_omitted_component(values, omitted_index, omitted_value)
+    return np.stack([w, x, y, z], axis=1)
 
 
 def write_spz(path: str | Path, gaussians: Gaussians) -> None:
@@ -432,7 +441,7 @@ def _encode_quats(wxyz: np.ndarray) -> np.ndarray:
     largest = np.abs(xyzw).argmax(axis=1)
     packed = largest.astype(np.uint32)
     is_flipped = xyzw[rows, largest] < 0
-    for component in _other_components(largest).T:
+    for component in OTHER_COMPONENTS[largest].T:
         value = xyzw[rows, component]
         magnitude = np.rint(_STEPS_PER_UNIT * np.abs(value)).clip(0, 511).astype(np.uint32)
         is_negative = ((value < 0) ^ is_flipped).astype(np.uint32)
@@ -452,13 +461,14 @@ def _encode_sh(sh: np.ndarray) -> np.ndarray:
 def describe_spz(path: Path) -> FileFacts:
     """Return the facts of a .spz's header."""
     with path.open("rb") as file:
-        content = read_spz_stream(file, path.stat().st_size, str(path))
+        start = _read_start(file, path.stat().st_size, str(path))
     warnings = []
-    if content.is_antialiased:
+    if start.header.flags & _ANTIALIASED_FLAG:
         warnings.append(ANTIALIASED_WARNING)
-    if content.up != UP:
+    if start.up != UP:
         warnings.append(f"its axes are stated by Adobe's record: viewers that skip it take {UP} up")
-    return FileFacts(version=f"version {content.version}", up=content.up, warnings=tuple(warnings))
+    version = f"version {start.header.version}"
+    return FileFacts(version=version, up=start.up, warnings=tuple(warnings))
 
 
 SPZ = SplatFormat(

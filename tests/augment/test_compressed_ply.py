@@ -186,6 +186,10 @@ def test_refusals(tmp_path: Path) -> None:
             compressed_ply(packed, {**good, "max_scale_x": math.inf, "min_scale_x": math.inf}),
             "no usable Gaussians.*NaN or infinite",
         ),
+        "large": (
+            compressed_ply(packed, {**good, "max_scale_x": 1e9, "min_scale_x": 1e9}),
+            "no usable Gaussians.*NaN or infinite",
+        ),
         "harmonics of others": (whole.replace(b"element sh 300", b"element sh 299"), "for 299"),
         "no format": (whole.replace(b"format binary_little", b"format binary_middle"), "line 2"),
     }

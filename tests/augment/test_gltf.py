@@ -299,6 +299,7 @@ def test_refusals(tmp_path: Path) -> None:
         "a URL": (changed("buffers", 0, "uri", to="http://a/b.bin"), "in the file's folder"),
         "not there": (changed("buffers", 0, "uri", to="b.bin"), "is not there"),
         "not base64": (changed("buffers", 0, "uri", to="data:;base64,*"), "cannot be read"),
+        "not ASCII": (changed("buffers", 0, "uri", to="data:;base64,\u00e9"), "cannot be read"),
         "too short": (changed("buffers", 0, "byteLength", to=999), "has 999 bytes; found 80"),
         "no data": (changed("buffers", 0, to={"byteLength": 80}), "found none"),
     }

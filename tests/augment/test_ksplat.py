@@ -207,6 +207,7 @@ def test_refusals(tmp_path: Path) -> None:
         "full buckets": (with_section(full=(1 << 32) - 1, size=0), "full buckets of 0"),
         "sizes": (with_section(size=(1 << 32) - 1, full=1, partial=0), "1 full buckets of 4294"),
         "an edge": (with_section(edge=math.nan), "edges of nan"),
+        "a far edge": (with_section(edge=3e38, steps=1), "no usable Gaussians"),
         "lengths": (whole[:start] + bytes(4 * facts[9]) + whole[start + 4 * facts[9] :], "buckets"),
         "long lengths": (
             whole[:start] + b"\xff" * (4 * facts[9]) + whole[start + 4 * facts[9] :],

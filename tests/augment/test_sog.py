@@ -188,10 +188,28 @@ def test_version_1_has_ranges_instead_of_codebooks(tmp_path: Path, has_sh: bool)
             torch.testing.assert_close(read.sh[0, 1:], codes / 255 * 2 - 1, rtol=0, atol=1e-6)
 
 
+Change = Callable[[dict[str, Any], dict[str, Any]], object]
+
+
+def check_refusals(
+    path: Path,
+    content: tuple[dict[str, Any], dict[str, bytes]],
+    cases: dict[str, tuple[Change, str]],
+) -> None:
+    """Each change of meta.json and the files is refused with its message."""
+    meta, images = content
+    for name, (change, message) in cases.items():
+        changed, files = json.loads(json.dumps(meta)), dict(images)
+        change(changed, files)
+        path.write_bytes(zipped(changed, files))
+        with pytest.raises(SceneError, match=message):
+            read_splats(path)
+            pytest.fail(name)
+
+
 def test_refusals_of_version_1(tmp_path: Path) -> None:
-    meta, images = one_gaussian_of_version_1()
     tall = cv2.imencode(".png", np.zeros((1025, 192, 3), np.uint8))[1].tobytes()
-    cases: dict[str, tuple[Callable[[dict[str, Any], dict[str, Any]], object], str]] = {
+    cases: dict[str, tuple[Change, str]] = {
         "no shape": (lambda m, f: m["means"].pop("shape"), "means.shape: Field required"),
         "no count": (lambda m, f: m["means"].update(shape=[]), "means.shape"),
         "none": (lambda m, f: m["means"].update(shape=[0, 3]), "means.shape.0"),
@@ -214,20 +232,12 @@ def test_refusals_of_version_1(tmp_path: Path) -> None:
         "damaged": (lambda m, f: f.update(p=f["p"][:40]), "p .*damaged"),
         "version": (lambda m, f: m.update(version=0), "only versions 1 and 2 .*; got 0"),
     }
-    path = tmp_path / "a.sog"
-    for name, (change, message) in cases.items():
-        changed, files = json.loads(json.dumps(meta)), dict(images)
-        change(changed, files)
-        path.write_bytes(zipped(changed, files))
-        with pytest.raises(SceneError, match=message):
-            read_splats(path)
-            pytest.fail(name)
+    check_refusals(tmp_path / "a.sog", one_gaussian_of_version_1(), cases)
 
 
 def test_refusals(tmp_path: Path) -> None:
     meta, images = one_gaussian()
-    bad = dict[str, tuple[Callable[[dict[str, Any], dict[str, Any]], object], str]]
-    cases: bad = {
+    cases: dict[str, tuple[Change, str]] = {
         "version": (lambda m, f: m.update(version=3), "only versions 1 and 2 .*; got 3"),
         "no means": (lambda m, f: m.pop("means"), "does not describe splats"),
         "a codebook": (lambda m, f: m["sh0"].update(codebook=[1.0]), "sh0.codebook: .* 256 items"),
@@ -245,13 +255,7 @@ def test_refusals(tmp_path: Path) -> None:
         "width": (lambda m, f: f.update(p=webp(wide=200)), "192 pixels wide for 1 bands; got 200"),
     }
     path = tmp_path / "a.sog"
-    for name, (change, message) in cases.items():
-        changed, files = json.loads(json.dumps(meta)), dict(images)
-        change(changed, files)
-        path.write_bytes(zipped(changed, files))
-        with pytest.raises(SceneError, match=message):
-            read_splats(path)
-            pytest.fail(name)
+    check_refusals(path, (meta, images), cases)
     whole = zipped(meta, images)
     for data, message in ((whole[:-40], "not a zip file"), (b"PK\3\4", "not a whole .sog file")):
         path.write_bytes(data)

@@ -16,6 +16,7 @@ import torch
 
 from augment.errors import SceneError
 from augment.files.formats import read_splats
+from augment.files.splat_checkpoint import describe_checkpoint
 from augment.scene.scene import Gaussians
 from tests.augment.test_splat_formats import check_ply, some_gaussians
 
@@ -131,6 +132,10 @@ def test_settings_are_read_without_their_classes(tmp_path: Path) -> None:
     torch.save(grut_content(before) | {"config": config}, path)
     with pytest.raises(SceneError, match="its density_activation is 'relu'"):
         read_splats(path)
+    config = settings({"render": {"particle_kernel_degree": torch.zeros(2)}})
+    torch.save(grut_content(before) | {"config": config, "global_step": torch.zeros(2)}, path)
+    check_ply(before, read_splats(path).gaussians)
+    assert describe_checkpoint(path).writer == "3DGRUT"
 
 
 # ---- Refusals ------------------------------------------------------------------------------------

@@ -208,6 +208,10 @@ def test_refusals_of_version_4(tmp_path: Path) -> None:
         "a long record": (packed_4(columns, records=b"12345678", **flagged), "ends behind all"),
         "half a record": (packed_4(columns, records=b"123", **flagged), "not a whole .spz"),
         "no axes": (packed_4(columns, records=record(0xADBE0003, b"\xff" * 99), **flagged), "axes"),
+        "long axes": (
+            packed_4(columns, records=record(0xADBE0003, b"\xff" * 9999), **flagged),
+            "its axes are number 4294967295; 0 to 16 are known",
+        ),
         "noise": (whole[:112] + np.random.default_rng(0).bytes(len(whole) - 112), "not a whole"),
         "version 5": (b"NGSP\5" + whole[5:], "version 5 of .spz is not read"),
     }
